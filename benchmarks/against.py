@@ -1,10 +1,11 @@
 """Trajectories and figures of this checkout beside those of an earlier one, in one alternating run.
 
-    python -m benchmarks against CHECKOUT [--rounds N] [--bench NAME ...] [--cell NAME ...]
+    python -m benchmarks against CHECKOUT [--rounds N] [--bench NAME ...] [--cell NAME ...] [--experiment NAME ...]
 
 Every simulated cell that both checkouts ship runs once in each; arms whose measured tool positions are equal bit for
 bit are named so, others with their largest distance. Every benchmark then runs in turns in a process of either
-checkout, with its own environment (``.venv``); of each figure the median of the rounds counts.
+checkout, with its own environment (``.venv``); of each figure the median of the rounds counts. The experiments of both
+run in their least form (``--quick``), and the means of equally named rows and measures stand side by side.
 """
 
 from __future__ import annotations
@@ -44,7 +45,16 @@ BENCHES: Mapping[str, tuple[str, ...]] = {
 }
 """Of each benchmark, what the names of the figures to compare contain."""
 
-_LIMIT_S = 1800
+EXPERIMENTS = (
+    "surface_following",
+    "object_tracking",
+    "single_arm_pushing",
+    "dual_arm_pushing",
+    "tall_objects",
+    "robustness",
+)
+
+_LIMIT_S = 3600
 
 
 @dataclass(frozen=True)
@@ -69,22 +79,25 @@ class TrajectoryDifference:
 
 
 def run(arguments: Sequence[str], out: Path) -> None:
-    """Print both tables; write ``against.json`` into ``out``."""
+    """Print the tables; write ``against.json`` into ``out``."""
     parser = argparse.ArgumentParser(prog="against", description=__doc__)
     parser.add_argument("checkout", type=Path, help="the earlier one, with a .venv of its own")
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--bench", nargs="*", choices=BENCHES, default=list(BENCHES))
     parser.add_argument("--cell", nargs="*", choices=CELLS, default=list(CELLS))
+    parser.add_argument("--experiment", nargs="*", choices=EXPERIMENTS, default=list(EXPERIMENTS))
     options = parser.parse_args(arguments)
     checkout = options.checkout.absolute()
     trajectories = [row for cell in options.cell for row in _compare_cell(cell, checkout)]
     figures = {name: _compare_bench(name, checkout, options.rounds) for name in options.bench}
+    experiments = {name: _compare_experiment(name, checkout) for name in options.experiment}
     report = {
         **provenance(),
         "checkout": checkout.name,
         "rounds": options.rounds,
         "trajectories": [asdict(row) for row in trajectories],
         "figures": figures,
+        "experiments": experiments,
     }
     (out / "against.json").write_text(json.dumps(report, indent=1) + "\n")
 
@@ -133,10 +146,37 @@ def _compare_bench(name: str, checkout: Path, rounds: int) -> dict[str, tuple[fl
         for key in then[0]
         if all(key in figures for figures in (*then, *now))
     }
-    print(f"\n{name:<60}{'then':>12}{'now':>12}{'ratio':>8}")
+    _print_figures(name, both)
+    return both
+
+
+def _print_figures(title: str, both: Mapping[str, tuple[float, float]]) -> None:
+    print(f"\n{title:<60}{'then':>12}{'now':>12}{'ratio':>8}")
     for key, (before, after) in both.items():
         print(f"{key[-60:]:<60}{before:>12.4g}{after:>12.4g}{after / before if before else np.nan:>8.2f}")
+
+
+def _compare_experiment(name: str, checkout: Path) -> dict[str, tuple[float, float]]:
+    then, now = (_means(name, at) for at in (checkout, CHECKOUT))
+    both = {key: (before, now[key]) for key, before in then.items() if key in now}
+    _print_figures(name, both)
     return both
+
+
+def _means(experiment: str, checkout: Path) -> dict[str, float]:
+    """Return what a checkout's experiment measured, by row and measure."""
+    with tempfile.TemporaryDirectory() as folder:
+        _touchcell(checkout, "experiment", experiment, "--quick", "--jobs", "1", "--out", folder)
+        found = Path(folder) / experiment / "summary.json"
+        if not found.exists():
+            return {}
+        rows = json.loads(found.read_text())["rows"]
+    return {
+        f"{row}: {measure}": float(statistics["mean"])
+        for row, measures in rows.items()
+        for measure, statistics in measures.items()
+        if isinstance(statistics, dict) and "mean" in statistics
+    } | {f"{row}: done": float(measures["done"]) for row, measures in rows.items()}
 
 
 def _figures(name: str, checkout: Path) -> dict[str, float]:

@@ -27,6 +27,7 @@ import yaml
 
 from touchcell.cell.bench.provenance import provenance
 from touchcell.cell.config.armed import REQUIRED_OF_ARMS, REQUIRED_OF_NETWORKS, REQUIRED_OF_SENSORS
+from touchcell.cell.config.layers import load_layers
 from touchcell.cell.config.schema import plan_cell
 from touchcell.errors import ConfigError
 from touchcell.paths import CONFIGS
@@ -138,7 +139,7 @@ def run(arguments: Sequence[str], out: Path) -> None:
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args(arguments)
     chance = random.Random(options.seed)
-    shipped = {path.stem: yaml.safe_load(path.read_text()) for path in sorted(CONFIGS.glob("*.yaml"))}
+    shipped = {path.stem: dict(load_layers(path).data) for path in sorted(CONFIGS.glob("*.yaml"))}
     moving = {name: data for name, data in shipped.items() if data.get("interlocks")}
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "cell.yaml"

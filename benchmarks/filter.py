@@ -1,6 +1,6 @@
 """``touchcell bench filter``: accuracy, consistency and cost of the SE(3) filter.
 
-Four parts, each with a table:
+Five parts, each with a table:
 
 * ``sequences`` (Lloyd & Lepora 2024, 5.3): contacts with known motion, four dynamics noise levels, MAE and predicted
   sigma per component against the single frames, consistency (NEES and NIS), and corrections robust to slip. With
@@ -8,6 +8,8 @@ Four parts, each with a table:
 * ``steps``: one correction by Gauss-Newton, one-step EKF and naively, and one prediction to second and to fourth order,
   run time against error.
 * ``cells``: recordings of shipped cells through the filters and no filter, at equal times, in each component.
+* ``slips``: contacts that move and slip, through the filters: simulated, or with ``--data`` and ``--model`` collected
+  (``data_collection`` with ``motions: sequence``).
 * ``tracking``: the shipped cell behind a moving plate, with the static and with the moving surface model in the loop.
 """
 
@@ -22,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks import filter_cells, filter_steps, filter_tracking
+from benchmarks import filter_cells, filter_slips, filter_steps, filter_tracking
 from benchmarks.filter_rivals import SlipFilter, StudentFilter
 from benchmarks.filter_sequences import ContactSequence, Track, filtered, labelled, single_frames, summary, synthetic
 from touchcell.cell.bench.provenance import provenance
@@ -35,7 +37,7 @@ LEVELS = (1.0, 0.3, 0.1, 0.03)
 
 SYNTHETIC_DRIFT = 0.1
 TORN_EVERY = 10
-PARTS = ("sequences", "steps", "tracking", "cells")
+PARTS = ("sequences", "steps", "tracking", "cells", "slips")
 _ORDER = ("z_mm", "alpha_deg", "beta_deg", "x_mm", "y_mm", "gamma_deg")
 _CORRECTIONS = {"plain": PoseFilter, "Student-t": StudentFilter, "slip inflation": SlipFilter}
 
@@ -60,6 +62,8 @@ def run(arguments: Sequence[str], out: Path) -> None:
     if "cells" in options.only:
         result["cells"] = filter_cells.compare()
         filter_cells.show(result["cells"])
+    if "slips" in options.only:
+        result["slips"] = _slips(options)
     if "tracking" in options.only:
         result["tracking"] = _tracking(options.seconds, options.sim_model)
         _plot_tracking(result["tracking"], out / "filter_tracking.png")
@@ -76,12 +80,26 @@ def _options(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--contacts", type=int, default=400, help="length of a simulated sequence")
     parser.add_argument("--draws", type=int, default=1000, help="random pairs for each row of the steps")
     parser.add_argument("--seconds", type=float, default=20.0, help="how long the plate is tracked")
+    parser.add_argument("--frame-hz", type=float, default=10.0, help="frames per second of collected sequences")
+    parser.add_argument("--seeds", type=int, default=2, help="estimators and sets of sequences that are simulated")
     parser.add_argument("--sim-model", type=Path, help="network for the tracking, in place of Gaussian errors")
     parser.add_argument("--only", nargs="+", choices=PARTS, default=PARTS)
     options = parser.parse_args(arguments)
     if (options.data is None) != (options.model is None):
         parser.error("--data and --model go together")
     return options
+
+
+def _slips(options: argparse.Namespace) -> list[list[dict[str, Any]]]:
+    if options.data is not None:
+        sets = [filter_slips.collected(options.data, options.split, options.model, options.frame_hz)]
+    else:
+        sets = [filter_slips.simulated(2 * options.orders, seed) for seed in range(options.seeds)]
+    tables = []
+    for sequences in sets:
+        tables.append(filter_slips.compare(sequences))
+        filter_slips.show(tables[-1])
+    return tables
 
 
 def _sequences(options: argparse.Namespace, out: Path) -> dict[str, Any]:

@@ -133,5 +133,7 @@ def _tests(module: Path, interlock: str) -> tuple[str, str]:
     )
     if done.returncode == 0:
         return "green", ""
+    if "InvalidCell" in done.stdout:
+        return "red", "the cell file is refused"
     found = re.search(r"^E +(?:AssertionError: |.*?Error: )?(.+)$", done.stdout, re.MULTILINE)
     return "red", found.group(1)[:90] if found else f"exit code {done.returncode}"

@@ -6,6 +6,7 @@ Prints the time per call, the deviation of open-loop integration from an exact p
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import json
 import time
 from collections.abc import Callable, Sequence
@@ -23,6 +24,13 @@ _CALLS = 5000
 _RATE_HZ = 250.0
 _DIAMETER_M = 0.15
 _LAP_S = 8.0
+_URDFS = (
+    *("ur3_robot.urdf", "ur5_robot.urdf", "ur10_robot.urdf", "ur3_gripper.urdf", "ur5_gripper.urdf"),
+    *("panda.urdf#panda_link8", "kinova.urdf", "xarm7.urdf", "z1.urdf#link06", "so100.urdf#jaw"),
+    *("so101.urdf#gripper_link", "talos_left_arm.urdf#gripper_left_base_link", "baxter.urdf#left_gripper"),
+    *("tiago_no_hand.urdf#torso_lift_link:wrist_ft_tool_link", "pr2.urdf#torso_lift_link:l_gripper_tool_frame"),
+    "romeo.urdf#torso:l_wrist",
+)
 _LIMITS = LimitsConfig().build()
 
 
@@ -35,11 +43,19 @@ def run(arguments: Sequence[str], out: Path) -> None:
     ik = DifferentialIk(chain)
     working = np.deg2rad([0.0, 40.0, 90.0, 0.0, 50.0, 0.0])
     times_us = _times(chain, ik, working)
+    faster_us = _engine_times(working)
+    arms = _arms()
     path_mm, turn_deg = _circle(chain, ik, working)
     fastest, smallest_m, reach_mm, off_mm = _reach_out(chain, ik, working)
     print(f"{'call, six joints':32s}{'median us':>12s}{'p99 us':>10s}")
     for name, (median_us, p99_us) in times_us.items():
         print(f"{name:32s}{median_us:12.1f}{p99_us:10.1f}")
+    if faster_us:
+        print("\nby pinocchio")
+        for name, (median_us, p99_us) in faster_us.items():
+            print(f"{name:32s}{median_us:12.1f}{p99_us:10.1f}")
+    for name, joints, worst in arms:
+        print(f"{name:56s}{joints:3d} joints, largest deviation from pinocchio {worst:.1e}")
     print(
         f"\ncircle of {_DIAMETER_M * 1e3:.0f} mm in {_LAP_S:g} s at {_RATE_HZ:g} Hz, open loop: off the path at most "
         f"{path_mm:.4f} mm, {turn_deg:.5f} deg"
@@ -49,6 +65,8 @@ def run(arguments: Sequence[str], out: Path) -> None:
     result = {
         "provenance": provenance(),
         "times_us": times_us,
+        "pinocchio_us": faster_us,
+        "arms": [{"name": name, "joints": joints, "deviation": worst} for name, joints, worst in arms],
         "circle": {"off_mm": path_mm, "off_deg": turn_deg},
         "reach_out": {
             "fastest_joint_rad_s": fastest,
@@ -80,6 +98,50 @@ def _times(chain: SerialChain, ik: DifferentialIk, q: Array) -> dict[str, tuple[
         "setpoint step": lambda: setpoint.step(0, 0.0),
     }
     return {name: _time(call) for name, call in calls.items()}
+
+
+def _engine_times(q: Array) -> dict[str, tuple[float, float]]:
+    """Return the same of what pinocchio computes; nothing where it is not installed."""
+    chain = SerialChain(ChainDescription.shipped("generic_6r"), Tool(origin_mm=(0, 0, 80), mass_kg=0.15))
+    if not chain.accelerate():
+        return {}
+    ik, twist = DifferentialIk(chain), np.array([0.05, 0.02, 0.0, 0.1, 0.0, 0.2])
+    return {
+        "forward": _time(lambda: chain.forward(q)),
+        "forward and Jacobian": _time(lambda: chain.forward_and_jacobian(q)),
+        "gravity torques": _time(lambda: chain.gravity_torques(q)),
+        "differential IK": _time(lambda: ik.solve(q, twist)),
+    }
+
+
+def _arms() -> list[tuple[str, int, float]]:
+    """Return name, joints, and largest deviation of poses and Jacobians of arms from URDF files, plain and faster.
+
+    The files are those of ``example-robot-data``; nothing where it or pinocchio is not installed.
+    """
+    if importlib.util.find_spec("pinocchio") is None:
+        return []
+    spec = importlib.util.find_spec("pinocchio")
+    assert spec is not None
+    assert spec.origin is not None
+    folder = Path(spec.origin).parents[4] / "share" / "example-robot-data" / "robots"
+    found: list[tuple[str, int, float]] = []
+    for name in _URDFS:
+        file, _, link = name.partition("#")
+        paths = sorted(folder.rglob(file)) if folder.is_dir() else []
+        if not paths:
+            continue
+        plain, fast = (
+            SerialChain(ChainDescription.named(f"{paths[0]}#{link}" if link else str(paths[0]))) for _ in "ab"
+        )
+        fast.accelerate()
+        worst = 0.0
+        for q in np.random.default_rng(1).uniform(-3.0, 3.0, (50, plain.joint_count)):
+            for ours, theirs in zip(plain.forward_and_jacobian(q), fast.forward_and_jacobian(q), strict=True):
+                worst = max(worst, float(np.abs(ours - theirs).max()))
+            worst = max(worst, float(np.abs(plain.gravity_torques(q) - fast.gravity_torques(q)).max()))
+        found.append((name, plain.joint_count, worst))
+    return found
 
 
 def _time(call: Callable[[], object]) -> tuple[float, float]:

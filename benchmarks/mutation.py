@@ -9,8 +9,8 @@ quickest first, until one fails; a changed constant of a module is replaced wher
 changes when a class is made (a default, a bound of a setting) needs a process that imports the mutant in place of the
 module and runs all of the tests that call anything of it.
 
-Mutants that no test notices are listed with file, line and change. Equivalent ones cannot be told apart and count as
-survivors.
+Mutants that no test notices are listed with file, line and change. Those that ``equivalent_mutants`` names, each with a
+reason, are tried like the others and do not count if they survive; the score is given with them too.
 """
 
 from __future__ import annotations
@@ -48,6 +48,7 @@ import pytest
 import yaml  # noqa: F401
 from _pytest.runner import runtestprotocol
 
+from benchmarks.equivalent_mutants import equivalent
 from touchcell.cell.bench.provenance import provenance
 from touchcell.paths import CHECKOUT
 
@@ -55,11 +56,12 @@ Change = Callable[[ast.AST], None]
 
 _OF_INTERLOCKS = (
     "tests/control/interlocks",
-    *(f"tests/control/test_{name}.py" for name in ("supervisor", "latch", "proof")),
+    *(f"tests/control/test_{name}.py" for name in ("supervisor", "latch", "proof", "rest")),
 )
 _OF_THE_GATE = ("tests/drivers/core/test_gate.py", "tests/drivers/core/test_gate_refusals.py")
 _OF_RUNS = tuple(
-    f"tests/cell/runtime/test_{name}.py" for name in ("stopping_measures", "stopping", "reset_procedure", "reset")
+    f"tests/cell/runtime/test_{name}.py"
+    for name in ("stopping_measures", "stopping", "stop_procedure", "reset_procedure", "reset")
 )
 MODULES: dict[str, tuple[str, tuple[str, ...]]] = {
     "gate": ("touchcell/drivers/core/gate.py", _OF_THE_GATE),
@@ -67,6 +69,7 @@ MODULES: dict[str, tuple[str, tuple[str, ...]]] = {
     "lease": ("touchcell/drivers/core/lease.py", _OF_THE_GATE),
     "latch": ("touchcell/control/latch.py", _OF_INTERLOCKS),
     "supervisor": ("touchcell/control/supervisor.py", _OF_INTERLOCKS),
+    "rest": ("touchcell/control/rest.py", _OF_INTERLOCKS),
     **{
         name: (f"touchcell/control/interlocks/{name}.py", _OF_INTERLOCKS)
         for name in (
@@ -89,6 +92,7 @@ MODULES: dict[str, tuple[str, tuple[str, ...]]] = {
         )
     },
     "stopping": ("touchcell/cell/runtime/stopping.py", _OF_RUNS),
+    "stop_procedure": ("touchcell/cell/runtime/stop_procedure.py", _OF_RUNS),
     "reset_procedure": ("touchcell/cell/runtime/reset_procedure.py", _OF_RUNS),
 }
 """Modules by name: the file, and where the tests stand that are about it."""
@@ -465,7 +469,7 @@ class _Trials(_WithoutShrinking):
         chosen = found
         if self._options.most and len(found) > self._options.most:
             chosen = random.Random(self._options.seed).sample(found, self._options.most)
-        dead, whole = 0, 0
+        dead, harmless, whole = 0, 0, 0
         for mutant in chosen:
             patch = patch_of(path, module, original, mutant, live)
             if patch is None:
@@ -489,12 +493,19 @@ class _Trials(_WithoutShrinking):
                 )
                 survives = code == 0
             dead += not survives
-            if survives:
+            reason = equivalent(name, source, mutant.line, mutant.what) if survives else ""
+            harmless += bool(reason)
+            if reason:
+                print(f"    {file}:{mutant.line}: {mutant.what}: equivalent: {reason}", flush=True)
+            elif survives:
                 self.survivors.append(f"{file}:{mutant.line}: {mutant.what}")
                 print(f"    {self.survivors[-1]}", flush=True)
-        self.rows.append({"module": name, "mutants": len(found), "tried": len(chosen), "killed": dead})
+        self.rows.append(
+            {"module": name, "mutants": len(found), "tried": len(chosen), "killed": dead, "equivalent": harmless}
+        )
         print(
-            f"{name:<16} {len(found):4d} mutants, {len(chosen):4d} tried, {dead:4d} killed ({whole} by import)",
+            f"{name:<16} {len(found):4d} mutants, {len(chosen):4d} tried, {dead:4d} killed, {harmless:3d} equivalent: "
+            f"{_percent(dead, len(chosen) - harmless):5.1f} % ({whole} by import)",
             flush=True,
         )
 
@@ -533,15 +544,25 @@ def run(arguments: Sequence[str], out: Path) -> None:
     pytest.main([*_OPTIONS, "-s", *tests], plugins=[trials])
     if trials.failed:
         raise SystemExit(f"fail without any mutation: {', '.join(trials.failed)}")
-    killed, total = (sum(cast(int, row[key]) for row in trials.rows) for key in ("killed", "tried"))
-    score = 100.0 * killed / max(total, 1)
+    killed, total, harmless = (
+        sum(cast(int, row[key]) for row in trials.rows) for key in ("killed", "tried", "equivalent")
+    )
+    score = _percent(killed, total - harmless)
     minutes = (time.monotonic() - started) / 60.0
-    print(f"{killed} of {total} killed: {score:.1f} %, in {minutes:.1f} min")
+    print(
+        f"{killed} of {total - harmless} killed: {score:.1f} %; {_percent(killed, total):.1f} % of all {total}; "
+        f"in {minutes:.1f} min"
+    )
     report = {
         **provenance(),
         "rows": trials.rows,
         "survivors": trials.survivors,
         "score_percent": score,
+        "score_of_all_percent": _percent(killed, total),
         "minutes": minutes,
     }
     (out / "mutation.json").write_text(json.dumps(report, indent=1) + "\n")
+
+
+def _percent(part: int, whole: int) -> float:
+    return 100.0 * part / max(whole, 1)

@@ -1,7 +1,8 @@
 """The recipe of docs/how-to/recipe.md from zero, with unlike sensors: collect, train, evaluate, and follow a surface.
 
 Each step is the command of the recipe in a process of its own. The sensors are simulated: the default one, the one
-fitted to real images, and one of nine rings whose camera is turned by 150 deg. None of their models ships.
+fitted to real images, one of nine rings whose camera is turned by 150 deg, and one whose camera sees the skin in a
+mirror. None of their models ships.
 """
 
 from __future__ import annotations
@@ -25,8 +26,12 @@ from touchcell.perception.models.labels import CONTACT_NAMES
 from touchcell.progress import shown_progress
 from touchcell.simulation.tip_file import SHIPPED
 
-_TURNED: Final = "turned"
-_SENSORS: Final = ("default", "franka_tactip_1", _TURNED)
+_FRANKA: Final = "franka_tactip_1"
+_CHANGED: Final = {
+    "turned": {"rings": 9, "ring_step_rad": 0.138, "image_rotation_rad": 2.6, "rim_follow": 0.1, "follow": 0.9},
+    "mirrored": {"mirrored": True, "rings": 8, "ring_step_rad": 0.155, "image_rotation_rad": -2.0, "follow": 0.9},
+}
+_SENSORS: Final = ("default", _FRANKA, *_CHANGED)
 _NAN: Final = float("nan")
 _STEPS: Final = ("collect", "train", "evaluate", "follow")
 
@@ -123,9 +128,9 @@ def _cell(folder: Path, name: str, shipped: str, tip: str | None) -> dict[str, A
 
 def _tip(folder: Path, sensor: str) -> str | None:
     """Return the value of ``tip:`` of a sensor; None for the default one."""
-    if sensor != _TURNED:
+    if sensor not in _CHANGED:
         return None if sensor == "default" else sensor
-    tip: dict[str, Any] = yaml.safe_load((SHIPPED / "franka_tactip_1.yaml").read_text())
-    tip["tip"] |= {"rings": 9, "ring_step_rad": 0.138, "image_rotation_rad": 2.6, "rim_follow": 0.1, "follow": 0.9}
-    (folder / "turned.yaml").write_text(yaml.safe_dump(tip, sort_keys=False))
-    return "turned.yaml"
+    tip: dict[str, Any] = yaml.safe_load((SHIPPED / f"{_FRANKA}.yaml").read_text())
+    tip["tip"] |= _CHANGED[sensor]
+    (folder / f"{sensor}.yaml").write_text(yaml.safe_dump(tip, sort_keys=False))
+    return f"{sensor}.yaml"

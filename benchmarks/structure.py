@@ -2,7 +2,8 @@
 
 A room is a folder with Python files. An arrow leads from one room to another that it imports, also inside functions and
 under TYPE_CHECKING. Two checkouts beside each other: ``python -m benchmarks structure . ../before``. The things added
-are those of the package that the tests install beside touchcell, which no file of touchcell names.
+are those of the package that the tests install beside touchcell, which no file of touchcell names. Where a
+checkout has an environment (``.venv``), ``touchcell check`` is run in turns with the others, for CPU time and memory.
 """
 
 from __future__ import annotations
@@ -10,16 +11,20 @@ from __future__ import annotations
 import argparse
 import ast
 import json
+import os
 import re
+import subprocess
 import tomllib
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import median
 from typing import Any, Final
 
 from touchcell.cell.bench.provenance import provenance
 
+_TURNS: Final = 5
 _OLD_TOPS: Final = ("geometry", "drivers", "perception", "control", "tasks", "cell", "benchmarks")
 _DIALECT: Final = re.compile(
     r"\b(told|tells?|telling|nobody|whoever|somebody|anybody|hurts?|go(?:es)? on|going on|words?|said|sa(?:ys|id) so"
@@ -168,14 +173,43 @@ def measure(root: Path) -> dict[str, Any]:
     }
 
 
+def _version(root: Path) -> str:
+    return str(tomllib.loads((root / "pyproject.toml").read_text())["project"]["version"])
+
+
+def check_costs(roots: Sequence[Path]) -> dict[Path, tuple[float, float]]:
+    """Return the CPU time (s) and peak memory (MB) of ``touchcell check`` in each checkout, medians of turns."""
+    spent: dict[Path, list[tuple[float, float]]] = {root: [] for root in roots}
+    for _ in range(_TURNS):
+        for root, costs in spent.items():
+            command = [str(root / ".venv" / "bin" / "touchcell"), "check", "configs/surface_follow_sim.yaml"]
+            process = subprocess.Popen(command, cwd=root, stdout=subprocess.DEVNULL)
+            _, status, usage = os.wait4(process.pid, 0)
+            process.returncode = os.waitstatus_to_exitcode(status)
+            if process.returncode:
+                raise RuntimeError(f"{' '.join(command)} ended with {process.returncode}")
+            costs.append((usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1024.0))
+    return {
+        root: (median(cpu_s for cpu_s, _ in costs), median(memory_mb for _, memory_mb in costs))
+        for root, costs in spent.items()
+    }
+
+
 def run(arguments: Sequence[str], out: Path) -> None:
     """Print the figures of each checkout; write ``structure.json`` into ``out``."""
     parser = argparse.ArgumentParser("structure", description=__doc__.partition("\n")[0])
     parser.add_argument("roots", nargs="*", type=Path, default=[Path(__file__).parent.parent], metavar="checkout")
-    roots = parser.parse_args(arguments).roots
-    found = {str(root): measure(root) for root in roots}
-    for root, figures in found.items():
-        print(root)
+    roots = [root.absolute() for root in parser.parse_args(arguments).roots]
+    costs = check_costs([root for root in roots if (root / ".venv").is_dir()])
+    found = {}
+    for root in roots:
+        figures = measure(root)
+        if root in costs:
+            cpu_s, memory_mb = costs[root]
+            figures |= {"check, CPU time": f"{cpu_s:.2f} s", "check, memory": f"{memory_mb:.0f} MB"}
+        found[f"touchcell {_version(root)}"] = figures
+    for title, figures in found.items():
+        print(title)
         for name, value in figures.items():
             if isinstance(value, dict):
                 print(f"  {name}")

@@ -30,6 +30,8 @@ class TouchcellError(Exception):
 def suggest(word: str, known: Iterable[str], *, otherwise: str = "known") -> str:
     """A hint for an unknown ``word``: "did you mean" one of ``known``, or all of them after ``otherwise``."""
     names = sorted(known)
+    if not names:
+        return "there is none"
     near = difflib.get_close_matches(word, names, n=1)
     return f"did you mean {near[0]!r}?" if near else f"{otherwise}: {', '.join(names)}"
 

@@ -27,6 +27,7 @@ class InputFile:
         folder: whether a folder is meant.
         suffixes: endings without which the key is a name and no path; none means that any text may be a path.
         hint: how to get such a file.
+        has_parts: whether ``#`` and the name of a part may follow the path.
     """
 
     noun: str
@@ -35,6 +36,7 @@ class InputFile:
     folder: bool = False
     suffixes: tuple[str, ...] = ()
     hint: str = ""
+    has_parts: bool = False
 
 
 def files_in(folder: Path, suffix: str) -> Callable[[], Mapping[str, Path]]:

@@ -7,3 +7,4 @@ CHECKOUT = PACKAGE.parent
 """The repository, where touchcell is installed from one: it also has the benchmarks that are not shipped."""
 CONFIGS = PACKAGE / "configs"
 MODELS = PACKAGE / "perception" / "models"
+CLASSIFIERS = PACKAGE / "perception" / "features"

@@ -43,7 +43,7 @@ def shown_progress(*, live: bool = True) -> Iterator[Show]:
 
 
 class ProgressLines:
-    """Writes a line at most every ``LINE_PERIOD_S``, so that a log shows that work goes on.
+    """Writes a line at most every ``LINE_PERIOD_S``, so that a log shows progress.
 
     Args:
         stream: where; None for standard error.

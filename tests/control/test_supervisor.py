@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -11,7 +11,9 @@ from hypothesis import strategies as st
 
 from touchcell.control.interlocks.basic import Depth, TcpSpeed
 from touchcell.control.interlocks.errors import SafetyTrip
+from touchcell.control.interlocks.level import Level
 from touchcell.control.interlocks.snapshot import ArmView, CellView, SensorView
+from touchcell.control.interlocks.timers import OnDelay, Reading, Sustained
 from touchcell.control.interlocks.violation import Severity, Violation
 from touchcell.control.latch import Latch, LatchState, Refusal, ResetDone, ResetRefused
 from touchcell.control.supervisor import Supervisor
@@ -241,3 +243,27 @@ def test_an_arm_whose_speeds_are_noisy_is_at_rest_when_its_positions_are(creep_m
         supervisor.review(seen(number * 20_000_000))
     outcome = supervisor.reset(OperatorToken("op", 40 * 20_000_000), seen(40 * 20_000_000))
     assert isinstance(outcome, ResetDone) is at_rest
+
+
+def test_it_shows_how_near_each_quantity_is_to_its_limit() -> None:
+    tilted = Sustained("shear", Severity.TRIP, lambda now: [Reading("sensor", 4.0)], "sheared by", 6.0, 5.0, "mm", 0.1)
+    lasting = OnDelay("limited", Severity.TRIP, lambda now: {"arm": "limited"}, 0.3)
+    supervisor = Supervisor([DEPTH, tilted, lasting], Latch())
+    assert supervisor.levels() == []
+    first = view()
+    supervisor.review(first)
+    supervisor.review(replace(first, now_ns=first.now_ns + 120_000_000))
+    assert supervisor.levels() == [
+        ("shear", Level("sensor", 4.0, 6.0, "mm")),
+        ("limited", Level("arm", pytest.approx(120.0), 300.0, "ms")),
+    ]
+
+
+def test_what_cannot_be_shown_disturbs_nothing() -> None:
+    def broken(now: CellView) -> list[Reading]:
+        raise RuntimeError("no such reading")
+
+    rule = Sustained("broken", Severity.TRIP, broken, "", 1.0, 1.0, "")
+    supervisor = Supervisor([rule], Latch())
+    supervisor.review(view())
+    assert supervisor.levels() == []

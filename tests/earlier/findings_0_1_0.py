@@ -147,6 +147,24 @@ def s6() -> str:
     return "no trip in 3 s"
 
 
+def s6_flicker() -> str:
+    def seen(k: int, depth_m: float) -> CellView:
+        return CellView((k + 1) * 10_000_000, {}, {"a": SensorView((k + 1) * 10_000_000, k, True, depth_m)}, "run")
+
+    settings = parse_interlocks({"deep": {"kind": "depth", "limit_mm": 4, "severity": "limit"}})
+    supervisor, flicker = Supervisor(build_interlocks(settings, {"a": np.eye(4)}), Latch()), "no trip in 10 s"
+    for k in range(1000):
+        supervisor.review(seen(k, 0.003 if k % 29 == 28 else 0.0045), ())
+        if supervisor.latch.first_cause is not None:
+            flicker = f"trips after {10 * (k + 1)} ms"
+            break
+    settings, latch = parse_interlocks({"deep": {"kind": "depth", "limit_mm": 4}}), Latch()
+    supervisor = Supervisor(build_interlocks(settings, {"a": np.eye(4)}), latch)
+    supervisor.review(seen(0, 0.0041), ())
+    supervisor.review(seen(1, 0.00399), ())
+    return f"28 of 29 cycles: {flicker}; 4.1 to 3.99 mm: {latch.state.value}"
+
+
 def s7() -> str:
     run = Loop(cells_of.on_true_contact(shipped(cells_of.PUSH)))
     for _ in range(100):
@@ -180,6 +198,23 @@ def r1() -> str:
     code, _ = cli("run", path, "--out", out, "--quiet")
     same = hashlib.sha256((out / "run.mcap").read_bytes()).digest() == before
     return f"exit {code}, first run {'untouched' if same else 'REPLACED'}"
+
+
+def r1_busy() -> str:
+    first, out = write(shipped(cells_of.FOLLOW)), HERE / "o"
+    program = "import sys; from cell.cli import main; sys.exit(main())"
+    command = [sys.executable, "-c", program, "run", str(first), "--out", str(out), "--quiet"]
+    going = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        while not (out / "run.mcap").exists() and going.poll() is None:
+            pass
+        other = write(cells_of.on_true_contact(shipped(cells_of.FOLLOW)) | {"name": "other"}, "other.yaml")
+        code, _ = cli("run", other, "--out", out, "--quiet")
+        kept = (out / "cell.yaml").read_bytes() == first.read_bytes()
+    finally:
+        going.kill()
+        going.wait()
+    return f"exit {code}; cell.yaml of the first {'untouched' if kept else 'REPLACED'}"
 
 
 def r2() -> str:
@@ -323,6 +358,69 @@ def r8() -> str:
     )
 
 
+def r8_arrays() -> str:
+    from drivers.errors import CommandRejected
+
+    gate = Gate()
+    lease, wrong, kinds = gate.desk.acquire("findings"), [], cells_of.odd_twists()
+    for kind, twist in kinds.items():
+        gate.clock.advance_s(0.01)
+        try:
+            command = TwistCommand(twist, TwistFrame.BASE, gate.clock.now_ns(), 0.1)
+            gate.gate.admit(command, lease, Lifecycle.ACTIVE, np.eye(4))
+        except CommandRejected:
+            continue
+        except Exception as error:
+            wrong.append(f"{kind}: {type(error).__name__}")
+    return f"{len(kinds) - len(wrong)} of {len(kinds)} kinds are sent or CommandRejected; {', '.join(wrong)}"
+
+
+def r8_back() -> str:
+    from control.view import ArmView
+    from drivers.samples import Stamped, TcpState
+
+    entry = {"kind": "workspace", "arm": "arm", "min_mm": [-100] * 3, "max_mm": [100] * 3, "margin_mm": 10}
+    passed = []
+    for name, command, measured in cells_of.ways_back():
+        (rule,) = build_interlocks(parse_interlocks({"it": entry}), {})
+        T = np.eye(4)
+        T[0, 3] = 10.0
+        arm = ArmView(
+            Stamped(TcpState(T, np.array(measured)), 1, 1), TwistCommand(np.array(command), TwistFrame.BASE, 1, 0.03)
+        )
+        passed += [] if rule.check(CellView(1, {"arm": arm}, {}, "run")) else [name]
+    return f"pass as a way back: {', '.join(passed) or 'none'}"
+
+
+def r8_missing() -> str:
+    settings = parse_interlocks(
+        {"frames": {"kind": "frame_age", "limit_ms": 100}, "states": {"kind": "arm_state_age", "limit_ms": 100}}
+    )
+    rules = build_interlocks(settings, {"sensor": np.eye(4)})
+    violated = [n for n, rule in zip(settings, rules, strict=True) if rule.check(CellView(10**9, {}, {}, "run"))]
+    return f"said by: {', '.join(violated) or 'no rule'}"
+
+
+def r8_page() -> str:
+    found = "Host" in (CHECKOUT / "cell" / "view.py").read_text()
+    return "checks the host" if found else "no Host check in its server"
+
+
+def r8_paint() -> str:
+    from drivers.simulation import _paint
+
+    image, noise, refused = np.zeros((60, 80), np.uint8), np.zeros((64, 90), np.int8), []
+    for name, call in {
+        "stamps (0, 0, s, s)": lambda: _paint.paint(image, np.zeros((1, 2)), np.zeros((0, 0, 5, 5), np.uint8)),
+        "top 2**63 - 1": lambda: _paint.expose(image, image, image, noise, 2**63 - 1, 0),
+    }.items():
+        try:
+            call()
+        except (TypeError, ValueError):
+            refused.append(name)
+    return f"refused: {', '.join(refused) or 'none'}"
+
+
 def a1() -> str:
     program = "import sys; sys.modules['torch'] = None; from cell.cli import main; sys.exit(main())"
     command = [sys.executable, "-c", program, "train", "--data", str(HERE), "--out", str(HERE / "m.safetensors")]
@@ -437,6 +535,8 @@ ROWS = {
     "S2": lambda: answers(cells_of.inactive(shipped)),
     "S3": lambda: answers(cells_of.too_deep(shipped)),
     **{"S4": s4, "S5": s5, "S6": s6, "S7": s7},
+    **{"S6b": s6_flicker, "R1b": r1_busy, "R8b": r8_arrays, "R8c": r8_back, "R8d": r8_missing},
+    **{"R8e": r8_page, "R8f": r8_paint},
     **{"R1": r1, "R2": r2, "R3": r3, "R4": r4, "R5": r5, "R6": r6, "R7": r7, "R8": r8},
     **{"a1": a1, "a2": a2, "a3": a3},
     "a4": lambda: answers(cells_of.badly_named(shipped)),

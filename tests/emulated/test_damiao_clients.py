@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -122,6 +122,71 @@ def test_it_decodes_injected_faults(controller: Any, emulator: EmulatorProcess) 
         while motor.get_states().get("status") != name:
             assert time.monotonic() < deadline
             time.sleep(0.005)
+
+
+def settle(motor: Any, send: Callable[[], None], reached: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + 10.0
+    while not reached():
+        assert time.monotonic() < deadline
+        send()
+        time.sleep(0.005)
+
+
+def fresh(motor: Any, register: int) -> float | int:
+    """Read a register again: the client keeps what it has once read, also after its own write."""
+    with motor.registers_lock:
+        motor.registers.clear()
+    return motor.get_register(register)  # type: ignore[no-any-return]
+
+
+def set_mode(motor: Any, mode: int) -> None:
+    motor.write_register(10, mode)
+    assert fresh(motor, 10) == mode
+
+
+def test_it_moves_a_motor_in_every_mode(controller: Any, emulator: EmulatorProcess) -> None:
+    motor = controller.get_motor(1)
+
+    def angle() -> float:
+        return float(emulator.state()["q_rad"][0])
+
+    def fastest() -> float:
+        return float(emulator.state()["dq_rad_s"][0])
+
+    set_mode(motor, 2)
+    motor.enable()
+    settle(motor, lambda: motor.send_cmd_pos_vel(0.2, 0.5), lambda: abs(angle() - 0.2) < 5e-3)
+    set_mode(motor, 3)
+    settle(motor, lambda: motor.send_cmd_vel(-0.3), lambda: abs(fastest() + 0.3) < 0.02)
+    set_mode(motor, 4)
+    settle(motor, lambda: motor.send_cmd_force_pos(0.1, 0.5, 0.5), lambda: abs(angle() - 0.1) < 5e-3)
+    # In another mode it hears nothing on this id, and stands.
+    before = angle()
+    for _ in range(20):
+        motor.send_cmd_pos_vel(1.0, 1.0)
+        time.sleep(0.002)
+    assert abs(angle() - before) < 5e-3
+
+
+def test_a_scale_that_it_changes_is_that_of_the_frames_and_lasts_only_when_stored(
+    controller: Any, emulator: EmulatorProcess
+) -> None:
+    motor = controller.get_motor(2)
+    motor.write_register(21, 6.25)
+    assert fresh(motor, 21) == 6.25
+    motor.request_motor_feedback()
+    deadline = time.monotonic() + 5.0
+    # The client still decodes with the old scale, which is twice as large.
+    while abs(np.rad2deg(motor.get_states().get("pos", 0.0)) - 2 * START_DEG[1]) > 0.5:
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+    emulator.fault("restart")
+    assert fresh(motor, 21) == 12.5
+    motor.write_register(21, 6.25)
+    motor.store_parameters()
+    assert fresh(motor, 21) == 6.25
+    emulator.fault("restart")
+    assert fresh(motor, 21) == 6.25
 
 
 def test_our_bytes_are_its_bytes_within_a_step(controller: Any) -> None:

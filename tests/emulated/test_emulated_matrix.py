@@ -12,6 +12,7 @@ from tests.fault_injection.emulated_cells import FAULT_ROLES
 from tests.fault_injection.emulated_matrix import (
     ARMS,
     CAMERAS,
+    DEVICES,
     HANG,
     REACH,
     SERVO,
@@ -26,6 +27,8 @@ from tests.fault_injection.emulated_matrix import (
 from touchcell.drivers.damiao.emulator import DamiaoArm
 from touchcell.drivers.feetech.emulator import FeetechArm
 from touchcell.drivers.franka.emulator.server import FrankaEmulator
+from touchcell.drivers.net_ft.emulator import NetFtBox
+from touchcell.drivers.robotiq.emulator import RobotiqHand
 from touchcell.drivers.ur.emulator.server import UrEmulator
 from touchcell.drivers.v4l2.emulator.server import V4l2Emulator
 
@@ -35,10 +38,12 @@ EMULATORS = {
     "damiao_can": DamiaoArm,
     "feetech_serial": FeetechArm,
     "v4l2": V4l2Emulator,
+    "net_ft": NetFtBox,
+    "robotiq": RobotiqHand,
 }
 
 
-@pytest.mark.parametrize("driver", [*ARMS, *CAMERAS])
+@pytest.mark.parametrize("driver", [*ARMS, *CAMERAS, *DEVICES])
 def test_every_fault_of_the_emulator_is_in_the_matrix(driver: str, tmp_path: Path) -> None:
     # A reset is not a fault: it returns everything to the start.
     assert faults_of(driver, tmp_path).keys() == {*EMULATORS[driver].faults, HANG, VANISH} - {"reset"}
@@ -86,6 +91,18 @@ def test_an_arm_that_hangs_while_it_follows_a_surface_ends_the_run(driver: str, 
 )
 def test_lost_frames_do_not_end_the_run_but_a_failed_camera_does(place: Place, ended_by: str, tmp_path: Path) -> None:
     case = Bench(tmp_path, 310_000).run(place)
+    assert (case.problem, case.ended_by) == ("", ended_by)
+
+
+@pytest.mark.parametrize(
+    ("place", "ended_by"),
+    [
+        (Place("net_ft", "status", "surface_following", "device", "run"), "DeviceFault"),
+        (Place("robotiq", "unplug", "surface_following", "device", "run"), "DeviceGone"),
+    ],
+)
+def test_a_failed_sensor_or_gripper_ends_the_run(place: Place, ended_by: str, tmp_path: Path) -> None:
+    case = Bench(tmp_path, 320_000).run(place)
     assert (case.problem, case.ended_by) == ("", ended_by)
 
 

@@ -23,9 +23,9 @@ NO_FILTER_HZ = 1000.0
 
 
 class Emulated:
-    def __init__(self) -> None:
+    def __init__(self, *arguments: str) -> None:
         self.host = fresh_host()
-        self.process = EmulatorProcess("franka", "--host", self.host, timeout_s=DEADLINE_S).start()
+        self.process = EmulatorProcess("franka", "--host", self.host, *arguments, timeout_s=DEADLINE_S).start()
 
 
 @pytest.fixture
@@ -111,6 +111,68 @@ def test_franky_loses_20_packets(emulated: Emulated, robot: franky.Robot) -> Non
 def test_franky_is_refused_while_another_client_is_connected(emulated: Emulated, robot: franky.Robot) -> None:
     with pytest.raises(franky.NetworkException):
         franky.Robot(emulated.host, realtime_config=franky.RealtimeConfig.Ignore)
+
+
+@pytest.fixture
+def patient() -> Iterator[Emulated]:
+    """An arm whose time waits for its client, as a late torque would be a reflex."""
+    one = Emulated("--patience", "0.3")
+    yield one
+    one.process.stop()
+
+
+def test_impedance_motions_move_the_arm_and_can_be_stopped(patient: Emulated) -> None:
+    robot = franky.Robot(patient.host, relative_dynamics_factor=FACTOR, realtime_config=franky.RealtimeConfig.Ignore)
+    goal = robot.current_pose.end_effector_pose.matrix
+    goal[0, 3] += 0.02
+    robot.move(franky.CartesianImpedanceMotion(franky.Affine(goal)), asynchronous=True)
+    eventually(lambda: abs(patient.process.state()["position_m"][0] - goal[0, 3]) < 1e-3)
+    assert patient.process.state()["mode"] == "move"
+    robot.move(franky.TorqueStopMotion(), asynchronous=True)
+    robot.join_motion()
+    state = patient.process.state()
+    assert (state["mode"], state["reflexes"]) == ("idle", 0)
+
+
+def test_an_impedance_motion_gives_way_to_a_push(patient: Emulated) -> None:
+    robot = franky.Robot(patient.host, relative_dynamics_factor=FACTOR, realtime_config=franky.RealtimeConfig.Ignore)
+    start = patient.process.state()["position_m"][1]
+    here = franky.Affine(robot.current_pose.end_effector_pose.matrix)
+    robot.move(franky.CartesianImpedanceMotion(here, translational_stiffness=500), asynchronous=True)
+    patient.process.wait_for(mode="move")
+    patient.process.fault("external_wrench", [0, 10, 0, 0, 0, 0])
+    eventually(lambda: patient.process.state()["position_m"][1] - start > 0.015)
+    patient.process.clear("external_wrench")
+    eventually(lambda: abs(patient.process.state()["position_m"][1] - start) < 2e-3)
+    robot.move(franky.TorqueStopMotion(), asynchronous=True)
+    robot.join_motion()
+
+
+def test_franky_homes_moves_and_grasps_with_the_hand(emulated: Emulated) -> None:
+    hand = franky.Gripper(emulated.host)
+    assert (hand.server_version, hand.max_width) == (3, 0.08)
+    assert hand.homing()
+    assert hand.move(0.06, 0.1)
+    assert emulated.process.state()["hand_width_m"] == pytest.approx(0.06)
+    emulated.process.fault("object", 0.03)
+    assert hand.grasp(0.03, 0.1, 20.0, 0.005, 0.005)
+    assert (hand.is_grasped, hand.width) == (True, 0.03)
+    assert hand.open(0.1)
+    assert not hand.grasp(0.06, 0.1, 20.0, 0.005, 0.005)
+    assert not hand.move(0.01, 0.1)
+    with pytest.raises(franky.CommandException, match="failed"):
+        hand.move(0.2, 0.1)
+    opening = hand.move_async(0.08, 0.01)
+    eventually(lambda: emulated.process.state()["hand_width_m"] > 0.031)
+    assert hand.stop()
+    with pytest.raises(franky.CommandException, match="aborted"):
+        opening.get()
+
+
+def test_a_missing_hand_refuses(emulated: Emulated) -> None:
+    emulated.process.fault("no_hand")
+    with pytest.raises(franky.NetworkException):
+        franky.Gripper(emulated.host)
 
 
 # pylibfranka and franky cannot live in one process: both register the same pybind11 types.

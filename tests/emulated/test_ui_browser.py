@@ -179,3 +179,100 @@ def test_reset_and_resume_on_the_page(browser: Any, tmp_path: Path) -> None:
 def tool_of(page: Any) -> str:
     """The bar of the workspace, which says where the tool is."""
     return str(page.get_by_text("inside the workspace", exact=False).first.inner_text())
+
+
+def text_of(page: Any) -> str:
+    """What the buttons that move an arm show: its state and its pose."""
+    return str(page.locator(".text-mono").first.inner_text())
+
+
+def z_of(page: Any) -> float:
+    found = re.search(r"z (-?[\d.]+)", text_of(page))
+    assert found is not None, text_of(page)
+    return float(found[1])
+
+
+def idle(page: Any) -> None:
+    page.wait_for_function("document.querySelector('.text-mono')?.innerText.startsWith('idle')")
+
+
+def test_an_arm_is_moved_from_the_page_for_as_long_as_a_button_is_held(browser: Any, tmp_path: Path) -> None:
+    out = tmp_path / "runs" / "jog"
+    jog = Process(tmp_path, "jog", str(cell(tmp_path, time="simulated")), "--ui", "--out", str(out))
+    try:
+        address = jog.address()
+        context = browser.new_context(viewport={"width": 390, "height": 800})
+        page = context.new_page()
+        page.set_default_timeout(1e3 * DEADLINE_S)
+        page.goto(address)
+        idle(page)
+        start_mm = z_of(page)
+        page.locator("[data-jog='z+']").scroll_into_view_if_needed()
+        box = page.locator("[data-jog='z+']").bounding_box()
+        page.mouse.move(box["x"] + 8, box["y"] + 8)
+        page.mouse.down()
+        jog.until(lambda: z_of(page) > start_mm + 1.0)
+        # Off the button is let go, pressed or not.
+        page.mouse.move(box["x"] + 8, box["y"] - 100)
+        idle(page)
+        held_mm = z_of(page)
+        page.mouse.up()
+        page.keyboard.down("o")
+        jog.until(lambda: z_of(page) > held_mm + 1.0)
+        page.keyboard.up("o")
+        idle(page)
+        # A tab that is closed while it is held lets go.
+        page.mouse.move(box["x"] + 8, box["y"] + 8)
+        page.mouse.down()
+        before_mm = z_of(page)
+        jog.until(lambda: z_of(page) > before_mm + 1.0)
+        page.close()
+        again = context.new_page()
+        again.set_default_timeout(1e3 * DEADLINE_S)
+        again.goto(address)
+        idle(again)
+        rest_mm = z_of(again)
+        again.get_by_text("hold", exact=True).wait_for()
+        again.get_by_text("step", exact=True).click()
+        again.locator("[data-jog='z+']").click()
+        jog.until(lambda: abs(z_of(again) - rest_mm - 1.0) < 0.06)
+        idle(again)
+        again.on("dialog", lambda dialog: dialog.accept())
+        again.locator("input[placeholder^='start']").fill("start")
+        again.get_by_role("button", name="save").click()
+        again.get_by_text("saved arms.arm.start_pose_mm_deg").wait_for()
+        again.get_by_role("button", name="stop", exact=True).click()
+        assert jog.process.wait(DEADLINE_S) == 0
+    finally:
+        jog.end()
+    assert "Traceback" not in jog.log.read_text()
+    start = yaml.safe_load((tmp_path / "cell.yaml").read_text())["arms"]["arm"]["start_pose_mm_deg"]
+    assert start[2] == pytest.approx(rest_mm + 1.0, abs=0.1)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_a_hundred_reloads_and_vanishing_tabs_leave_no_traceback(browser: Any, tmp_path: Path) -> None:
+    out = tmp_path / "runs" / "jog"
+    jog = Process(tmp_path, "jog", str(cell(tmp_path, time="simulated")), "--ui", "--out", str(out))
+    try:
+        address = jog.address()
+        context = browser.new_context()
+        page = context.new_page()
+        page.set_default_timeout(1e3 * DEADLINE_S)
+        page.goto(address)
+        idle(page)
+        for k in range(100):
+            # Some are gone before their WebSocket is open, others while it is.
+            page.goto(address, wait_until=("commit", "domcontentloaded")[k % 2])
+            if k % 10 == 0:
+                page.goto("about:blank")
+        page.goto(address)
+        idle(page)
+        page.get_by_role("button", name="stop", exact=True).click()
+        assert jog.process.wait(DEADLINE_S) == 0
+    finally:
+        jog.end()
+    text = jog.log.read_text()
+    assert "Traceback" not in text
+    assert "rror" not in text

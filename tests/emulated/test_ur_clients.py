@@ -116,6 +116,85 @@ def test_a_second_client_is_refused_as_the_registers_are_in_use(emulator: Emulat
     first.disconnect()
 
 
+def test_every_family_of_commands_works_or_is_refused(emulator: EmulatorProcess, host: str) -> None:
+    receive = rtde_receive.RTDEReceiveInterface(host)
+    control = rtde_control.RTDEControlInterface(host)
+    start = emulator.state()["pose"]
+
+    assert control.forceMode([0.0] * 6, [0, 0, 1, 0, 0, 0], [0, 0, -10.0, 0, 0, 0], 2, [0.02] * 6)
+    wait_until(lambda: emulator.state()["pose"][2] < start[2] - 0.005, "motion by force")
+    assert control.forceModeStop()
+    assert control.freedriveMode()
+    emulator.fault("wrench", [20.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    wait_until(lambda: emulator.state()["pose"][0] > start[0] + 0.005, "motion by hand")
+    emulator.clear("wrench")
+    assert control.endFreedriveMode()
+    assert control.teachMode()
+    assert control.endTeachMode()
+    assert control.jogStart([0.0, 0.02, 0.0, 0.0, 0.0, 0.0])
+    wait_until(lambda: emulator.state()["pose"][1] > start[1] + 0.005, "jog")
+    assert control.jogStop()
+    assert not emulator.state()["moving"]
+
+    q = emulator.state()["q"]
+    further = [angle + 0.1 for angle in q]
+    assert control.moveJ([[*further, 1.0, 2.0, 0.0], [*q, 1.0, 2.0, 0.0]])
+    assert emulator.state()["q"] == pytest.approx(q, abs=1e-5)
+
+    emulator.fault("wrench", [0.0, 0.0, 8.0, 0.0, 0.0, 0.0])
+    assert control.moveUntilContact([0.0, 0.0, -0.02, 0.0, 0.0, 0.0])
+    emulator.clear("wrench")
+    assert control.zeroFtSensor()
+    assert control.ftRtdeInputEnable(True)
+    assert control.ftRtdeInputEnable(False)
+
+    assert control.poseTrans([0.1, 0, 0, 0, 0, 0], [0, 0.1, 0, 0, 0, 1.0]) == pytest.approx([0.1, 0.1, 0, 0, 0, 1.0])
+    tool = [0.0, 0.0, 0.1, 0.0, 0.0, 0.0]
+    assert control.setTcp(tool)
+    assert control.getForwardKinematics(q, tool)[:3] == pytest.approx(emulator.state()["position_m"], abs=1e-4)
+    assert not control.getInverseKinematicsHasSolution([3.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    assert not control.isJointsWithinSafetyLimits([10.0] * 6)
+    assert not control.isPoseWithinSafetyLimits([3.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    assert control.sendCustomScriptFunction("signal", "set_standard_digital_out(3, True)\n")
+    wait_until(lambda: receive.getDigitalOutState(3), "output set by the script")
+
+    higher = emulator.state()["pose"]
+    higher[2] += 0.02
+    assert control.servoC(higher, 0.1, 0.5, 0.0)
+    wait_until(lambda: abs(emulator.state()["pose"][2] - higher[2]) < 1e-6, "circular servo")
+    control.disconnect()
+    receive.disconnect()
+
+
+@pytest.mark.parametrize(("generation", "rate_hz"), [("cb3", 125.0), ("e", 500.0)])
+def test_generations_have_their_own_rate_and_version(host: str, generation: str, rate_hz: float) -> None:
+    with EmulatorProcess("ur", "--host", host, "--generation", generation) as emulator:
+        receive = rtde_receive.RTDEReceiveInterface(host)
+        dashboard = dashboard_client.DashboardClient(host)
+        dashboard.connect()
+        assert dashboard.polyscopeVersion().startswith("3." if generation == "cb3" else "5.")
+        assert dashboard.isInRemoteControl() is (generation == "e")
+        stamps = {receive.getTimestamp()}
+        wait_until(lambda: stamps.add(receive.getTimestamp()) or len(stamps) > 20, "state packets")
+        ticks = [round(stamp * rate_hz, 6) for stamp in stamps]
+        assert all(tick == round(tick) for tick in ticks)
+        control = rtde_control.RTDEControlInterface(host)
+        goal = [angle + 0.02 for angle in emulator.state()["q"]]
+        assert control.moveJ(goal, 1.0, 4.0)
+        assert emulator.state()["q"] == pytest.approx(goal)
+        control.disconnect()
+        receive.disconnect()
+
+
+def test_polyscope_x_has_no_dashboard(host: str) -> None:
+    with EmulatorProcess("ur", "--host", host, "--generation", "x"):
+        receive = rtde_receive.RTDEReceiveInterface(host)
+        assert receive.getRobotMode() == 7
+        with pytest.raises(RuntimeError):
+            dashboard_client.DashboardClient(host).connect(500)
+        receive.disconnect()
+
+
 CLIENT = """
 import sys, time, rtde_control
 control = rtde_control.RTDEControlInterface(sys.argv[1])

@@ -25,6 +25,9 @@ FAULT_ROLES: Final = {
 }
 """Roles of arms that may be the emulated one, by task. Each has a sensor, which may be the emulated one as well."""
 
+DEVICE_ROLE: Final = "device"
+"""Name of an emulated device that is neither arm nor camera."""
+
 _GAP_M: Final = 0.004
 _TIP_RADIUS_M: Final = 0.020
 _PRISM_M: Final = (0.080, 0.080, 0.060)
@@ -140,6 +143,19 @@ def camera_cell(task: str, cameras: Mapping[str, DeviceFixture], collected: str)
         "frozen_frame": {"kind": "frame_frozen", "limit_ms": 300},
         "exposure": {"kind": "exposure", "limit_percent": 15},
     }
+    return data
+
+
+def device_cell(rig: DeviceFixture) -> dict[str, Any]:
+    """Return a cell that follows a surface with simulated devices, and reads the emulated device of ``rig`` besides."""
+    assert rig.config is not None
+    T_base_tcp = se3.from_euler_mm_deg([400.0, 0.0, 300.0, *_DOWN])
+    scene = {"surfaces": {"plate": _plate(T_base_tcp, moves=False)}}
+    sensors = {"sensor": _simulated_sensor("arm", np.eye(4), {"kind": "true_contact"})}
+    arms = {"arm": _simulated_arm(T_base_tcp)}
+    data = _cell("surface_following", arms, sensors, {"arm": T_base_tcp[:3, 3]}, {"scene": scene})
+    data["devices"] = {DEVICE_ROLE: {"driver": rig.spec.name, **rig.config.model_dump(mode="json", exclude_unset=True)}}
+    data["interlocks"]["stale_device"] = {"kind": "reading_age", "limit_ms": 500}
     return data
 
 

@@ -18,7 +18,15 @@ from typing import Any, Final
 import numpy as np
 import yaml
 
-from tests.fault_injection.emulated_cells import FAULT_ROLES, arm_cell, camera_cell, sensor_of, sensors_of
+from tests.fault_injection.emulated_cells import (
+    DEVICE_ROLE,
+    FAULT_ROLES,
+    arm_cell,
+    camera_cell,
+    device_cell,
+    sensor_of,
+    sensors_of,
+)
 from tests.fault_injection.sent_commands import SentCommands
 from touchcell.cell.config.cell_plan import CellPlan
 from touchcell.cell.config.schema import plan_cell
@@ -41,6 +49,7 @@ from touchcell.testing.emulation.rig import RIGS, DeviceFixture, Emulated
 
 ARMS: Final = ("ur", "franka", "damiao_can", "feetech_serial")
 CAMERAS: Final = ("v4l2",)
+DEVICES: Final = ("net_ft", "robotiq")
 VANISH: Final = "kill -9"
 HANG: Final = "SIGSTOP"
 
@@ -72,6 +81,8 @@ MORE_FAULTS: Final[Mapping[str, Mapping[str, tuple[Any, str]]]] = {
         "version": (8, "unseen"),
         "other_client": (True, "unseen"),
         "slow_recovery": (1.0, "unseen"),
+        "object": (0.03, "unseen"),
+        "no_hand": (True, "unseen"),
     },
     "damiao_can": {
         "push": ([0, 5.0], "unseen"),
@@ -133,6 +144,16 @@ MORE_FAULTS: Final[Mapping[str, Mapping[str, tuple[Any, str]]]] = {
         "slow_start": (1.0, "unseen"),
         "dark": (True, "fault"),
         "true_rate": (2.0, "stale"),
+    },
+    "net_ft": {
+        "wrench": ([0.0, 0.0, 5.0, 0.0, 0.0, 0.0], "unseen"),
+        "delay": (0.004, "unseen"),
+        "bad_calibration": (True, "unseen"),
+    },
+    "robotiq": {
+        "delay": (0.01, "unseen"),
+        "object": (30.0, "unseen"),
+        "never_activates": (True, "unseen"),
     },
 }
 """Faults that the conformance suite lacks or tests differently, with a value and the reaction in a running task."""
@@ -241,6 +262,7 @@ LEFT_OUT: Final = (
     "the effect of a camera's fault does not depend on the arm that carries it: v4l2 is mounted on simulated arms",
     "jog sends the twists that other tasks send: its states are tried with simulated devices, and its process is "
     "killed beside an emulated arm in tests/emulated/test_jog_process.py",
+    "a device that is neither arm nor camera is read in each cycle whatever the task: tried in surface_following",
 )
 """Cases that are not part of the matrix."""
 
@@ -254,7 +276,7 @@ def places(driver: str, folder: Path) -> Iterator[tuple[Place, str]]:
         driver: of ``ARMS`` or ``CAMERAS``.
         folder: for the rig, of which only the faults are used.
     """
-    tasks: list[str] = [*FAULT_ROLES]
+    tasks: list[str] = [*FAULT_ROLES] if driver not in DEVICES else ["surface_following"]
     if driver in CAMERAS:
         tasks.append("observe")
     elif driver in _COARSE:
@@ -264,6 +286,7 @@ def places(driver: str, folder: Path) -> Iterator[tuple[Place, str]]:
         states, servoes = states_of(task)
         for role in FAULT_ROLES.get(task, ("",)):
             target = role if driver in ARMS else sensor_of(role or "arm")
+            target = DEVICE_ROLE if driver in DEVICES else target
             for state in states:
                 rule = _rule(task, state, servoes=servoes)
                 for fault, (_, reaction) in faults.items():
@@ -310,7 +333,12 @@ class Bench:
         with ExitStack() as exits:
             try:
                 emulator = _started(rig, exits)
-                plan = self._arm_plan(place, rig) if place.driver in ARMS else self._camera_plan(place, rig, exits)
+                if place.driver in DEVICES:
+                    plan = self._planned(device_cell(rig))
+                elif place.driver in ARMS:
+                    plan = self._arm_plan(place, rig)
+                else:
+                    plan = self._camera_plan(place, rig, exits)
                 return _run(case, rig, emulator, plan, value)
             except TouchcellError as error:
                 return replace(case, reached=False, problem=f"before the fault: {error}")
@@ -367,6 +395,8 @@ def _run(case: EmulatedCase, rig: DeviceFixture, emulator: Emulated, plan: CellP
     given_up_ns: int | None = None
     witness: _Witness | None = None
     stalls: _Stalls | None = None
+    # A device that fails before the fault, as it does where the machine starves it, leaves the block without a result.
+    unjudged = case = replace(case, reached=False, problem="the cell failed before the fault could be judged")
     with ExitStack() as watch, suppress(DeviceError), cell:
         task = cell.task
         assert isinstance(task, MachineTask)
@@ -398,6 +428,7 @@ def _run(case: EmulatedCase, rig: DeviceFixture, emulator: Emulated, plan: CellP
         else:
             # Effects of the stop at the end are not a reaction to the fault.
             causes = [cause for cause in result.causes if given_up_ns is None or cause.t_ns < given_up_ns]
+            case = replace(case, reached=True, problem="")
             case = _judged(case, cell, replace(result, causes=tuple(causes)), sent, ended_s - injected_s)
             case = replace(case, stalled_s=stalls.longest_s)
         if witness is not None:
@@ -405,6 +436,8 @@ def _run(case: EmulatedCase, rig: DeviceFixture, emulator: Emulated, plan: CellP
             witness.close()
             case = _with_rest(case, witness, ended_s)
         _mend(emulator, place.fault)
+    if case is unjudged and injected_s is not None and stalls is not None:
+        case = replace(case, stalled_s=stalls.longest_s)
     return case
 
 
@@ -440,7 +473,7 @@ def _judged(case: EmulatedCase, cell: Cell, result: RunResult, sent: SentCommand
         problems.append("a command was sent after the trip")
     simulated = {role: stop for role, stop in result.stops.items() if cell.arms[role].name != _emulated_arm(case)}
     problems += [f"{role}: {stop.problem}" for role, stop in simulated.items() if stop.problem]
-    if by and case.place.driver in CAMERAS:
+    if by and case.place.driver not in ARMS:
         times = [stop.time_s for stop in simulated.values() if stop.time_s is not None]
         ways = [stop.distance_m for stop in simulated.values() if stop.distance_m is not None]
         case = replace(case, rest_s=max(times, default=None), distance_m=max(ways, default=None))

@@ -21,7 +21,17 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import Any, Final
 
-from tests.fault_injection.emulated_matrix import ARMS, CAMERAS, LEFT_OUT, RULES, EmulatedCase, Place, faults_of, places
+from tests.fault_injection.emulated_matrix import (
+    ARMS,
+    CAMERAS,
+    DEVICES,
+    LEFT_OUT,
+    RULES,
+    EmulatedCase,
+    Place,
+    faults_of,
+    places,
+)
 from tests.fault_injection.fault_matrix import median_and_worst
 from touchcell.cell.bench.provenance import provenance
 
@@ -73,7 +83,9 @@ class _Worker:
 def run(arguments: Sequence[str], out: Path) -> None:
     """Print the table; write ``faults.json`` into ``out``. Takes about two seconds per case."""
     parser = argparse.ArgumentParser(prog="touchcell bench faults", description=__doc__.partition("\n")[0])
-    parser.add_argument("names", nargs="*", metavar="driver", help=f"of {', '.join((*ARMS, *CAMERAS))}; default: all")
+    parser.add_argument(
+        "names", nargs="*", metavar="driver", help=f"of {', '.join((*ARMS, *CAMERAS, *DEVICES))}; default: all"
+    )
     parser.add_argument("--state", action="append", help="only in this state of the tasks")
     parser.add_argument("--task", action="append", help="only in this task")
     parser.add_argument("--all", action="store_true", help="also cases that are equivalent to another by rule")
@@ -86,7 +98,7 @@ def run(arguments: Sequence[str], out: Path) -> None:
     with tempfile.TemporaryDirectory(prefix="touchcell-faults-") as folder:
         everything = [
             (place, rule)
-            for driver in options.names or (*ARMS, *CAMERAS)
+            for driver in options.names or (*ARMS, *CAMERAS, *DEVICES)
             for place, rule in places(driver, Path(folder))
             if (options.state is None or place.state in options.state)
             and (options.task is None or place.task in options.task)

@@ -9,6 +9,7 @@ and evidence, a of use.
 from __future__ import annotations
 
 import argparse
+import asyncio
 import contextlib
 import getpass
 import hashlib
@@ -40,15 +41,21 @@ from touchcell.cell.runtime.black_box import read_left_ring
 from touchcell.cell.runtime.operator_channel import OperatorChannel
 from touchcell.cell.runtime.operator_input import stop_on_keys
 from touchcell.cell.runtime.stop_request import StopRequest
+from touchcell.cell.ui.access import Access
 from touchcell.control.interlocks.config import build_interlocks, parse_interlocks
-from touchcell.control.interlocks.snapshot import CellView, SensorView
+from touchcell.control.interlocks.planning_scene import PlanningScene
+from touchcell.control.interlocks.snapshot import ArmView, CellView, SensorView
+from touchcell.control.interlocks.timers import TimedInterlock
 from touchcell.control.latch import Latch
 from touchcell.control.supervisor import Supervisor
 from touchcell.drivers.core.commands import TwistCommand, TwistFrame
+from touchcell.drivers.core.errors import CommandRejected
+from touchcell.drivers.core.samples import Stamped, TcpState
 from touchcell.drivers.ur.driver import UrArm
 from touchcell.errors import ConfigError, TouchcellError
 from touchcell.geometry import se3
 from touchcell.paths import CHECKOUT, CONFIGS
+from touchcell.simulation import _paint
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +71,7 @@ class Row:
     """One finding.
 
     Attributes:
-        name: S1 to S7, R1 to R8, a1 to a13.
+        name: S1 to S7, R1 to R8, a1 to a13; those with a letter behind are parts of one finding.
         title: what was found.
         before: what 0.1.0 did.
         reproduce: gives what happens now, in an empty folder.
@@ -191,6 +198,30 @@ def s6(folder: Path) -> Now:
     return Now("no trip in 3 s", False)
 
 
+def s6_flicker(folder: Path) -> Now:
+    """A limit that is exceeded in 28 of 29 cycles, and one that is left by a hair."""
+    settings = parse_interlocks({"deep": {"kind": "depth", "limit_mm": 4, "severity": "limit"}})
+    supervisor = Supervisor(build_interlocks(settings, {"a": np.eye(4)}), Latch())
+    tripped_ms = 0
+
+    def seen(k: int, depth_m: float) -> CellView:
+        return CellView((k + 1) * 10_000_000, {}, {"a": SensorView((k + 1) * 10_000_000, k, True, depth_m)}, "run")
+
+    for k in range(1000):
+        supervisor.review(seen(k, 0.003 if k % 29 == 28 else 0.0045), ())
+        if supervisor.latch.first_cause is not None:
+            tripped_ms = 10 * (k + 1)
+            break
+    settings = parse_interlocks({"deep": {"kind": "depth", "limit_mm": 4}})
+    latch = Latch()
+    supervisor = Supervisor(build_interlocks(settings, {"a": np.eye(4)}), latch)
+    supervisor.review(seen(0, 0.0041), ())
+    supervisor.review(seen(1, 0.00399), ())
+    state = latch.state.value
+    flicker = f"trips after {tripped_ms} ms" if tripped_ms else "no trip in 10 s"
+    return Now(f"28 of 29 cycles: {flicker}; 4.1 to 3.99 mm: {state}", bool(tripped_ms) and state == "tripped")
+
+
 def s7(folder: Path) -> Now:
     """One driver's exception, and the other arm."""
     from touchcell.cell.runtime.compose import compose
@@ -246,6 +277,26 @@ def r1(folder: Path) -> Now:
 
 def _tripping(folder: Path) -> Path:
     return _file(folder, cells_of.tripping(_shipped), "trip.yaml")
+
+
+def r1_busy(folder: Path) -> Now:
+    """A run into the folder of another that goes on."""
+    out = folder / "o"
+    first = _file(folder, _shipped())
+    command = [sys.executable, "-m", "touchcell", "run", str(first), "--out", str(out), "--quiet"]
+    environment = {**os.environ, "PYTHONPATH": str(CHECKOUT)}
+    going = subprocess.Popen(command, cwd=folder, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        while not (out / "cell.yaml").exists() and going.poll() is None:
+            pass
+        other = _file(folder, _true_contact(_shipped()) | {"name": "other"}, "other.yaml")
+        code, told = _quiet("run", other, "--out", out, "--quiet")
+        kept = (out / "cell.yaml").read_bytes() == first.read_bytes()
+    finally:
+        going.kill()
+        going.wait()
+    text = f"exit {code}; cell.yaml of the first {'untouched' if kept else 'REPLACED'}: {_first(told)}"
+    return Now(text, kept and code == 2)
 
 
 def r2(folder: Path) -> Now:
@@ -355,6 +406,92 @@ def r8(folder: Path) -> Now:
         f"300 mutated cells: {wrong} tracebacks; first command from rest with ttl 1 s: {1e3 * speed:.1f} mm/s at once"
     )
     return Now(text, wrong == 0 and speed < 0.02)
+
+
+def r8_arrays(folder: Path) -> Now:
+    """Twists that are no arrays of six float64."""
+    run = OperatedRun(folder)
+    lease = run.arm.acquire("findings")
+    answers = []
+    for kind, twist in cells_of.odd_twists().items():
+        try:
+            command = TwistCommand(twist, TwistFrame.BASE, run.cell.clock.now_ns(), 0.1)
+            run.arm.send_twist(command, lease)
+            answers.append((kind, "sent"))
+        except CommandRejected:
+            answers.append((kind, "CommandRejected"))
+        except Exception as error:
+            answers.append((kind, type(error).__name__))
+    run.arm.release(lease)
+    run.end()
+    wrong = [f"{kind}: {answer}" for kind, answer in answers if answer not in ("sent", "CommandRejected")]
+    text = f"{len(answers) - len(wrong)} of {len(answers)} kinds are sent or CommandRejected"
+    return Now(text + (f"; {', '.join(wrong)}" if wrong else ""), not wrong)
+
+
+def r8_back(folder: Path) -> Now:
+    """Ways back into the box that are none, 10 m outside."""
+    entry = {"kind": "workspace", "arm": "arm", "min_mm": [-100] * 3, "max_mm": [100] * 3, "margin_mm": 10}
+    passed = []
+    for name, command, measured in cells_of.ways_back():
+        (rule,) = build_interlocks(parse_interlocks({"it": entry}), {})
+        assert isinstance(rule, TimedInterlock)
+        arm = ArmView(
+            Stamped(TcpState(se3.from_euler_mm_deg(np.array([1e4, 0, 0, 0, 0, 0.0])), np.array(measured)), 1, 1),
+            TwistCommand(np.array(command), TwistFrame.BASE, 1, 0.03),
+        )
+        violation, _ = rule.evaluate(CellView(1, {"arm": arm}, {}, "run"), {})
+        passed += [] if violation else [name]
+    return Now(f"pass as a way back: {', '.join(passed) or 'none'}", not passed)
+
+
+def r8_missing(folder: Path) -> Now:
+    """A sensor and an arm that are missing from the view."""
+    settings = parse_interlocks(
+        {"frames": {"kind": "frame_age", "limit_ms": 100}, "states": {"kind": "arm_state_age", "limit_ms": 100}}
+    )
+    rules = build_interlocks(settings, {"sensor": np.eye(4)}, PlanningScene({"arm": np.eye(4)}))
+    violated = [
+        name
+        for name, rule in zip(settings, rules, strict=True)
+        if not isinstance(rule, TimedInterlock) and rule.check(CellView(10**9, {}, {}, "run")) is not None
+    ]
+    return Now(f"said by: {', '.join(violated) or 'no rule'}", len(violated) == 2)
+
+
+def r8_page(folder: Path) -> Now:
+    """A request to the operator's page under another host's name: DNS rebinding."""
+    answered: list[int] = []
+
+    async def send(message: Any) -> None:
+        answered.extend([message["status"]] if message["type"] == "http.response.start" else [])
+
+    async def page(scope: Any, receive: Any, send: Any) -> None:
+        answered.append(200)
+
+    async def receive() -> Any:
+        return {"type": "http.request"}
+
+    headers = [(b"host", b"evil.example:8177")]
+    scope = {"type": "http", "method": "GET", "path": "/", "query_string": b"", "headers": headers}
+    asyncio.run(Access(page, token="t", hosts=frozenset({"127.0.0.1:8177"}))(scope, receive, send))
+    return Now(f"answers {answered[0]}", answered[0] == 421)
+
+
+def r8_paint(folder: Path) -> Now:
+    """Stamps of no size, and a window far outside, in C."""
+    image, noise = np.zeros((60, 80), np.uint8), np.zeros((64, 90), np.int8)
+    calls: dict[str, Callable[[], object]] = {
+        "stamps (0, 0, s, s)": lambda: _paint.paint(image, np.zeros((1, 2)), np.zeros((0, 0, 5, 5), np.uint8)),
+        "top 2**63 - 1": lambda: _paint.expose(image, image, image, noise, 2**63 - 1, 0),
+    }
+    refused = []
+    for name, call in calls.items():
+        with contextlib.suppress(TypeError, ValueError):
+            call()
+            continue
+        refused.append(name)
+    return Now(f"refused: {', '.join(refused) or 'none'}", len(refused) == 2)
 
 
 # Use
@@ -517,8 +654,10 @@ ROWS = (
     Row("S4", "gate state shared with callers", "NaN written into it reached the arm", s4),
     Row("S5", "lease=None while nobody holds one", "sent; the arm moved 5 mm/s", s5),
     Row("S6", "LIMIT whose worst subject alternates", "no trip in 3 s", s6),
+    Row("S6b", "LIMIT that flickers; no hysteresis", "28 of 29 cycles: no trip; cause gone at once", s6_flicker),
     Row("S7", "one driver's OSError at a stop", "step() raised; the other arm was told late", s7),
     Row("R1", "a second run into one folder", "exit 0, recording replaced", r1),
+    Row("R1b", "a run into the folder of one that goes on", "refused after cell.yaml was replaced", r1_busy),
     Row("R2", "exit code of a trip in a pipe", "| true: 0; >/dev/full: 1 with a traceback", r2),
     Row("R3", "key r without a passwd entry", "KeyError, no result, no black box", r3),
     Row("R4", "black box after kill -9, SIGSEGV", "none in one process", r4),
@@ -526,6 +665,11 @@ ROWS = (
     Row("R6", "damaged recordings", "547 of 2072 tracebacks, changed values read; bomb 348 s", r6),
     Row("R7", "a loop that hangs 0.5 s", "done, no violation", r7),
     Row("R8", "YAML fuzz; first command from rest", "2341 of 9475 tracebacks; 0 to 100 mm/s at once", r8),
+    Row("R8b", "twists that are no six float64", "others than CommandRejected are raised", r8_arrays),
+    Row("R8c", "a way back that is none", "-1e-9 m/s, 5 m/s sideways, measured outwards: all pass", r8_back),
+    Row("R8d", "a role that is missing from the view", "frame_age and arm_state_age say nothing", r8_missing),
+    Row("R8e", "the page under another host's name", "no Host check", r8_page),
+    Row("R8f", "C: stamps of no size, a window far outside", "read outside their arrays (ASAN)", r8_paint),
     Row("a1", "recipe; torch missing; reason of a failure", "12-line traceback; reason ''; why: no black box", a1),
     Row("a2", "probe's pose is not the run's", "100 mm off, not told", a2),
     Row("a3", "generic top-level packages", "benchmarks cell configs control drivers geometry ...", a3),

@@ -69,11 +69,24 @@ def inactive(shipped: Shipped) -> dict[str, Cell]:
     step = {"kind": "out_of_step", "limit_mm_s": 30, "limit_mm": 4, "hold_ms": 100, "leader": "ledaer"}
     lost = {"kind": "contact_lost", "limit_ms": 500, "states": ["setle", "rnu"]}
     unsure = {"kind": "uncertain", "limit_mm": 1}
+    alone = {**step, "leader": "leader", "follower_sensor": "leader_sensor", "follower": "leader"}
+    lean = {"kind": "toppling", "limit_deg": 10, "limit_deg_s": 30, "limit_mm": 4, "hold_ms": 100, "arms": ["a", "b"]}
     return {
         "states: [setle, rnu]": changed(one, "interlocks.lost", lost),
         "leader: ledaer": changed(both, "interlocks.step", step),
         "inconsistent without a filter": unfiltered,
         "uncertain on true contact": changed(on_true_contact(one), "interlocks.sure", unsure),
+        "exposure on true contact": changed(
+            on_true_contact(one), "interlocks.light", {"kind": "exposure", "limit_percent": 15}
+        ),
+        "out_of_range on true contact": changed(
+            on_true_contact(one), "interlocks.range", {"kind": "out_of_range", "limit_ms": 300}
+        ),
+        "markers_lost with a gdn": changed(
+            one, "interlocks.markers", {"kind": "markers_lost", "limit_percent": 10, "frames": 3}
+        ),
+        "out_of_step of one sensor": changed(both, "interlocks.step", alone),
+        "toppling with arms [a, b]": changed(both, "interlocks.lean", lean),
     }
 
 
@@ -184,3 +197,31 @@ def safety_example(shipped: Shipped, page: str) -> dict[str, Any]:
             data[section][name] = data[section].get(name, {}) | entry
     data["obstacles"] = example["obstacles"]
     return data
+
+
+def odd_twists() -> dict[str, Any]:
+    """R8b: what a caller may take for a twist."""
+    import numpy as np
+
+    return {
+        "list": [0.005, 0, 0, 0, 0, 0],
+        "float32": np.zeros(6, np.float32),
+        "integers": np.zeros(6, int),
+        "text": np.array(["0"] * 6),
+        "objects": np.array([None] * 6),
+        "complex": np.zeros(6, complex),
+        "booleans": np.zeros(6, bool),
+        "None": None,
+        "ragged": [[0.0], 0.0, 0.0, 0.0, 0.0, 0.0],
+        "five": np.zeros(5),
+    }
+
+
+def ways_back() -> list[tuple[str, list[float], list[float]]]:
+    """R8c: name, commanded and measured twist of an arm that is far outside along x."""
+    still = [0.0] * 6
+    return [
+        ("-1e-9 m/s", [-1e-9, 0, 0, 0, 0, 0], still),
+        ("-0.1 m/s with 5 m/s sideways", [-0.1, 5.0, 0, 0, 0, 0], still),
+        ("commanded back, measured outwards", [-0.1, 0, 0, 0, 0, 0], [0.1, 0, 0, 0, 0, 0]),
+    ]

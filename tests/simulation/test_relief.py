@@ -82,3 +82,24 @@ def test_a_pin_is_felt_where_it_is() -> None:
 
 def test_out_of_contact_nothing_is_felt() -> None:
     assert felt(Sphere(0.05), z_mm=80.0) is None
+
+
+@pytest.mark.parametrize("thickness_mm", [0.2, 1.0, 3.0])
+def test_a_thin_wall_feels_as_a_thick_one_does(thickness_mm: float) -> None:
+    thick, thin = (felt(Box((0.2, 0.2, 1e-3 * h)), z_mm=h + 17.0) for h in (20.0, thickness_mm))
+    assert thick is not None
+    assert thin is not None
+    assert np.allclose(thin, thick, atol=1e-9)
+
+
+def test_a_thin_bent_wall_feels_as_a_ball_does() -> None:
+    outer, inner = primitives.ball(0.050), primitives.ball(0.049)
+    shell = TriangleMesh(
+        np.concatenate([outer.vertices, inner.vertices]),
+        np.concatenate([outer.faces, inner.faces[:, ::-1] + len(outer.vertices)]).astype(np.int32),
+    )
+    solid = felt(Sphere(0.050), z_mm=67.0)
+    hollow = felt(MeshShape(shell, 0.5), z_mm=67.0)
+    assert solid is not None
+    assert hollow is not None
+    assert np.abs(hollow - solid).max() < 2e-4

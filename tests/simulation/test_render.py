@@ -76,8 +76,15 @@ def test_compiled_kernels_refuse_unsupported_arrays() -> None:
             compiled.paint(wrong, np.zeros((1, 2)), STAMPS.stamps)
     with pytest.raises(TypeError, match="of one shape"):
         compiled.expose(image, image, image[1:], np.zeros((64, 90), np.int8), 0, 0)
-    with pytest.raises(ValueError, match="leaves the noise"):
-        compiled.expose(image, image, image, np.zeros((64, 90), np.int8), 5, 0)
+    with pytest.raises(TypeError, match="p > 0"):
+        compiled.paint(image, np.zeros((1, 2)), np.zeros((0, 0, 5, 5), np.uint8))
+    noise = np.zeros((64, 90), np.int8)
+    for top, left in ((5, 0), (0, 11), (-1, 0), (0, -1), (2**63 - 1, 0), (0, 2**63 - 1)):
+        with pytest.raises(ValueError, match="leaves the noise"):
+            compiled.expose(image, image, image, noise, top, left)
+    for top, left in ((2**63, 0), (0, -(2**63) - 1)):
+        with pytest.raises(OverflowError):
+            compiled.expose(image, image, image, noise, top, left)
 
 
 def test_the_same_seed_draws_the_same_frames() -> None:

@@ -131,3 +131,13 @@ def test_the_camera_is_a_pinhole_behind_the_sphere() -> None:
     assert np.hypot(*near) == pytest.approx(p.focal_px * 0.01 / p.camera_distance_m)
     assert np.hypot(*far) < np.hypot(*near)
     assert math.atan2(near[1], near[0]) == pytest.approx(p.image_rotation_rad)
+
+
+def test_a_mirrored_camera_reverses_the_image_about_its_vertical_axis() -> None:
+    straight, mirrored = (
+        Tip(TipParameters(image_rotation_rad=0.4)),
+        Tip(TipParameters(image_rotation_rad=0.4, mirrored=True)),
+    )
+    u = straight.parameters.centre_px[0]
+    places = straight.marker_positions(contact(1.5, -2.0, 4.0, 10.0, -15.0, 3.0))
+    np.testing.assert_allclose(mirrored.project(places), [2.0 * u, 0.0] + straight.project(places) * [-1.0, 1.0])

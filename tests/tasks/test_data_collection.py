@@ -159,6 +159,46 @@ def test_a_stop_withdraws_the_sensor(state):
     assert plant.sensor_in_surface()[2, 3] == pytest.approx(-0.003, abs=1e-4) or state in ("lift", "tilt")
 
 
+def test_a_sequence_stays_in_contact_and_labels_every_frame_with_where_the_sensor_was():
+    config = DataCollectionConfig(samples=500, motions="sequence", sequence_frames=300, seed=5, **FAST)
+    plant, task, labels, late = KnownPlane(), SPEC.build(config, CONTEXT), [], []
+    while not task.finished:
+        before = plant.sensor_in_surface()
+        for T_f_s in plant.cycle(task).labels.values():
+            labels.append(se3.to_euler_mm_deg(T_f_s))
+            late.append(min(np.linalg.norm((T - T_f_s)[:3, 3]) for T in (before, plant.sensor_in_surface())))
+    contact = np.array(labels)
+    assert task.succeeded
+    assert len(contact) == 500
+    # Both sequences begin in the air and then stay in contact.
+    first, second = contact[:300], contact[300:]
+    for sequence in (first, second):
+        touching = sequence[:, 2] > 0.0
+        assert not touching[0]
+        assert touching[touching.argmax() :].all()
+    assert np.hypot(first[:, 0], first[:, 1]).max() > 1.0
+    assert max(late) < 1e-3
+    states = [record.target for record in task.transitions]
+    assert "grab" not in states
+    assert states.count("lift") == 3
+
+
+def test_sequences_are_collected_in_simulation_with_labels_of_the_time_of_the_frame(tmp_path):
+    assert run(cell_file(tmp_path, samples=40, motions="sequence", sequence_frames=40)).outcome is Outcome.DONE
+    split = read_split(tmp_path / "data", "train")
+    assert len(split.images) == 30
+    assert split.contact_mm_deg[0, 2] < 0.0
+    assert (split.contact_mm_deg[10:, 2] > 0.4).all()
+
+
+def test_a_collection_begun_before_a_setting_existed_is_continued(tmp_path):
+    Collection(tmp_path / "data", {"train": 1}, {"seed": 1})
+    about = {"seed": 1, "motions": "single"}
+    assert Collection(tmp_path / "data", {"train": 1}, about, {"motions": "single"}).kept == 0
+    with pytest.raises(ConfigError, match="other settings"):
+        Collection(tmp_path / "data", {"train": 1}, {"seed": 1, "motions": "sequence"}, {"motions": "single"})
+
+
 @settings(max_examples=50)
 @given(st.lists(st.floats(-0.3, 0.3), min_size=12, max_size=12))
 def test_reaching_ends_at_the_goal_within_its_limits(numbers):

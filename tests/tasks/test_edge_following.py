@@ -18,10 +18,12 @@ from touchcell.control.curvature import CurvatureEstimator
 from touchcell.errors import ConfigError
 from touchcell.geometry import se3
 from touchcell.paths import CONFIGS
+from touchcell.perception.features.feature_model import TouchedFeature
 from touchcell.simulation.closed_forms import Box, Cylinder
 from touchcell.simulation.edges import nearest_edge
 from touchcell.simulation.motions import Still
 from touchcell.simulation.surfaces import Plane, Surface
+from touchcell.tasks.edge_following import EdgeFollowingConfig, FollowEdge
 
 CELL = CONFIGS / "edge_follow_sim.yaml"
 
@@ -103,6 +105,12 @@ def test_an_estimator_of_surfaces_is_refused_by_check() -> None:
         plan_cell(CONFIGS / "surface_follow_sim.yaml", settings={"sensors.sensor.estimator": {"kind": "true_edge"}})
 
 
+def test_a_filter_of_surfaces_is_refused_for_edges() -> None:
+    drift = {"drift_mm_per_sqrt_s": 1.0, "drift_deg_per_sqrt_s": 5.0}
+    with pytest.raises(ConfigError, match="it predicts the motion of a surface, and edge_network estimates an edge"):
+        plan_cell(CELL, settings={"sensors.sensor.estimator.filter": drift})
+
+
 def test_the_edge_frame_points_off_the_face_and_along_the_edge() -> None:
     box = Surface(Box((0.08, 0.08, 0.02)))
     T_world_s = over(43.0, 10.0, 37.0)
@@ -151,3 +159,39 @@ def test_a_mesh_is_followed_like_its_closed_form(tmp_path: Path) -> None:
     )
     assert result.outcome.value == "done", result.reason
     assert rms(edge[:, 0]) < 0.3
+
+
+EDGE = TouchedFeature(0.0, 0.1, 0.5, 0.4)
+FACE = TouchedFeature(0.0, 0.97, 0.02, 0.01)
+
+
+def test_no_edge_is_followed_where_there_is_none() -> None:
+    behavior = FollowEdge(EdgeFollowingConfig())
+    assert [behavior.astray(0.033, FACE) for _ in range(3)] == [""] * 3
+    assert behavior.astray(0.033, FACE) == "touches no edge to follow: surface by 97 %"
+
+
+def test_the_middle_of_a_plate_is_no_edge(tmp_path: Path) -> None:
+    plate = {"plate": {"kind": "box", "size_mm": [400, 400, 20]}}
+    plan = plan_cell(CELL, settings={"scene.surfaces": plate})
+    cell = compose(plan)
+    with Recorder(tmp_path / "run.mcap") as recorder, cell:
+        result = RunLoop(cell, recorder).run()
+    assert result.outcome.value == "failed"
+    assert "touches no edge to follow: surface" in result.reason
+
+
+def test_an_edge_that_is_lost_ends_the_task_after_a_while_and_corners_are_edges() -> None:
+    behavior = FollowEdge(EdgeFollowingConfig(edge_lost_ms=350.0))
+    assert behavior.astray(0.01, EDGE) == ""
+    behavior.update(0.01, np.eye(4), np.eye(4), None)
+    # A corner of a third of a second that looks like a face, and an edge again.
+    assert [behavior.astray(0.1, each) for each in (FACE, FACE, EDGE, FACE, FACE, FACE)] == [""] * 6
+    assert behavior.astray(0.1, FACE).startswith("lost the edge after 0 mm")
+    assert behavior.telemetry()["edge_percent"] == pytest.approx(3.0)
+
+
+def test_without_a_classifier_nothing_is_judged() -> None:
+    behavior = FollowEdge(EdgeFollowingConfig())
+    assert [behavior.astray(1.0, None) for _ in range(3)] == [""] * 3
+    assert "edge_percent" not in behavior.telemetry()

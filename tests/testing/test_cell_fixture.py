@@ -151,3 +151,11 @@ def test_the_ground_truth_tells_how_long_an_arm_moved_that_its_driver_cannot_see
     with pytest.raises(AssertionError, match="declared"):
         following.assert_stopped_as_declared()
     following.assert_truly_stopped_as_declared()
+
+
+def test_an_arm_that_the_test_has_broken_is_given_back_all_the_same(cell):
+    with CellUnderTest("single_push_bench.yaml", on="sim") as pushing:
+        pushing.run_for(0.5)
+        pushing.inject("arm", stale=True)
+        pushing.run_until_trip(limit_s=1.0)
+    assert pushing.cell.arms["arm"].state.name != "FAULTED"

@@ -65,10 +65,8 @@ def load_cell(
     Raises:
         ConfigError: with file, line, key, value and remedy; InvalidCell for several mistakes at once.
     """
-    file = Path(path)
     overrides = {} if data is None else {"data": Path(data)}
-    named = find_cell(file if file.suffix else file.with_suffix(".yaml"))
-    return plan_cell(file if file.is_file() else named, overrides, model=model, settings=set)
+    return plan_cell(find_cell(Path(path)), overrides, model=model, settings=set)
 
 
 def run(cell: str | PathLike[str] | CellPlan, *, out: str | PathLike[str] | None = None, live: bool = False) -> CellRun:

@@ -6,17 +6,21 @@ See docs/explanation/armed-coverage.md.
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from itertools import count
 
 from touchcell.control.interlocks.coverage import CannotTrip, CellFacts, Fault, Provable
 from touchcell.control.interlocks.interlock import Interlock
 from touchcell.control.interlocks.settings import InterlockSettings
+from touchcell.control.interlocks.snapshot import CellView
 from touchcell.control.interlocks.timers import TimedInterlock
 from touchcell.control.interlocks.violation import Violation
 from touchcell.control.latch import Latch
 from touchcell.control.supervisor import LIMIT_FOR_NS, Supervisor
+
+_Healthy = Callable[[int, str], CellView]
 
 _START_NS = 10**12
 _HEALTHY_CYCLES = 2
@@ -73,18 +77,24 @@ def prove(
         return (Proof(name, settings.kind, "", problem=f"its faults cannot be described: {error!r}"),)
     if not cases:
         return (Proof(name, settings.kind, "", problem="it guards nothing in this cell", key="kind"),)
-    return tuple(_proof(name, settings.kind, case, interlock, facts) for case in cases)
+    healthy = cache(facts.healthy)
+    return tuple(_proof(name, settings.kind, case, interlock, facts, healthy) for case in cases)
 
 
 def _proof(
-    name: str, kind: str, case: Fault | CannotTrip, interlock: Interlock | TimedInterlock, facts: CellFacts
+    name: str,
+    kind: str,
+    case: Fault | CannotTrip,
+    interlock: Interlock | TimedInterlock,
+    facts: CellFacts,
+    healthy: _Healthy,
 ) -> Proof:
     if isinstance(case, CannotTrip):
         return Proof(name, kind, case.subject, problem=case.reason, key=case.key, hint=case.hint, fatal=case.fatal)
     slowest_s = 0.0
     problem = ""
     for state in case.states or facts.states or ("",):
-        tripped_s, problem = _shown(name, case, interlock, facts, state)
+        tripped_s, problem = _shown(name, case, interlock, facts.period_s, healthy, state)
         if tripped_s is None:
             break
         slowest_s = max(slowest_s, tripped_s)
@@ -104,7 +114,7 @@ def _proof(
 
 
 def _shown(
-    name: str, fault: Fault, interlock: Interlock | TimedInterlock, facts: CellFacts, state: str
+    name: str, fault: Fault, interlock: Interlock | TimedInterlock, period_s: float, healthy: _Healthy, state: str
 ) -> tuple[float | None, str]:
     """Return the time from the fault to the trip in one state of the task, and why there was none."""
     # These trips are none: nobody has to read of them.
@@ -112,15 +122,15 @@ def _shown(
     quiet.disabled = True
     latch = Latch(quiet)
     supervisor = Supervisor([interlock], latch)
-    period_ns = max(1, round(1e9 * facts.period_s))
-    healthy = max(_HEALTHY_CYCLES, -int(-1e9 * fault.before_s // period_ns))
+    period_ns = max(1, round(1e9 * period_s))
+    before = max(_HEALTHY_CYCLES, -int(-1e9 * fault.before_s // period_ns))
     # An interlock that first limits trips later by that long.
     last_s = fault.within_s + 1e-9 * LIMIT_FOR_NS + 2e-9 * period_ns
-    for k in count(-healthy):
+    for k in count(-before):
         t_s = 1e-9 * k * period_ns
         if t_s > last_s:
             return None, f"{fault.what}: does not trip within {fault.within_s:g} s{_in(state)}"
-        view = facts.healthy(_START_NS + k * period_ns, state)
+        view = healthy(_START_NS + k * period_ns, state)
         try:
             view = (fault.before if k < 0 else fault.change)(view, t_s)
         except Exception as error:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -12,23 +12,19 @@ import numpy as np
 from touchcell.control.interlocks.basic import Finite
 from touchcell.control.interlocks.errors import SafetyTrip
 from touchcell.control.interlocks.interlock import Interlock
+from touchcell.control.interlocks.level import Level
 from touchcell.control.interlocks.snapshot import CellView
-from touchcell.control.interlocks.timers import NO_MARKS, InterlockState, TimedInterlock
+from touchcell.control.interlocks.timers import NO_MARKS, InterlockState, Levelled, TimedInterlock
 from touchcell.control.interlocks.violation import Severity, Violation
 from touchcell.control.latch import Latch, LatchState, ResetDone, ResetRefused
+from touchcell.control.rest import RestMonitor
 from touchcell.drivers.core.device import OperatorToken
-from touchcell.drivers.core.samples import Stamped, TcpState
 
 LIMIT_FOR_NS: Final = 300_000_000
 """An interlock that limits for longer trips, whatever its subjects were and however it flickered."""
 
 FORGIVEN: Final = 4
 """While an interlock does not limit, its counted time decreases this many times more slowly than it increased."""
-
-_REST_WINDOW_NS: Final = 550_000_000
-_STOOD_FOR_NS: Final = 450_000_000
-_FEWEST_SEEN: Final = 5
-_MOST_SEEN: Final = 1000
 
 REDUCED: Final = 0.25
 """Speed scaling while a LIMIT violation is present."""
@@ -66,11 +62,16 @@ class _Remembered:
         self.name = rule.name
         self.severity = rule.severity
         self._rule = rule
+        self._levelled = rule if isinstance(rule, Levelled) else None
         self._past: InterlockState = NO_MARKS
 
     def check(self, view: CellView) -> Violation | None:
         violation, self._past = self._rule.evaluate(view, self._past)
         return violation
+
+    def levels(self, view: CellView, past: InterlockState) -> Iterator[Level]:
+        if self._levelled is not None:
+            yield from self._levelled.levels(view, self._past)
 
 
 class Supervisor:
@@ -83,8 +84,7 @@ class Supervisor:
     Args:
         interlocks: the configured interlocks.
         latch: stores their violations.
-        rest_m_s, rest_rad_s: an arm whose measured speeds are at most these is at rest; so is one whose positions over
-            the last half a second show no larger ones, where its speeds are noisier.
+        rest_m_s, rest_rad_s: an arm whose measured speeds are at most these is at rest; see ``RestMonitor``.
     """
 
     def __init__(
@@ -98,12 +98,12 @@ class Supervisor:
         self._finite = Finite()
         # Classified once: isinstance with a Protocol costs more than most interlocks.
         self._rules = tuple(_Remembered(rule) if isinstance(rule, TimedInterlock) else rule for rule in interlocks)
+        self._levelled = tuple((rule.name, rule) for rule in self._rules if isinstance(rule, Levelled))
         self._latch = latch
-        self._rest_m_s = rest_m_s
-        self._rest_rad_s = rest_rad_s
+        self._rest = RestMonitor(rest_m_s, rest_rad_s)
         self._limiting: dict[str, _Limiting] = {}
         self._reviewed_ns = 0
-        self._seen: dict[str, deque[Stamped[TcpState]]] = {}
+        self._view: CellView | None = None
 
     @property
     def latch(self) -> Latch:
@@ -117,11 +117,8 @@ class Supervisor:
             view: snapshot of this cycle.
             alarms: violations from other sources, such as the watchdog; used as they are.
         """
-        for name, arm in view.arms.items():
-            seen = self._seen.setdefault(name, deque(maxlen=_MOST_SEEN))
-            seen.append(arm.state)
-            while arm.state.t_ns - seen[0].t_ns > _REST_WINDOW_NS:
-                seen.popleft()
+        self._view = view
+        self._rest.note(view)
         violations = (*alarms, *self._violations(view))
         self._latch.update(violations)
         first = self._latch.first_cause
@@ -132,12 +129,27 @@ class Supervisor:
             trip=None if first is None else first.as_error(),
         )
 
+    def levels(self) -> list[tuple[str, Level]]:
+        """Return what is on its way to the limits of which interlocks, as of the latest review.
+
+        Interlocks that cannot tell, and one that raises, have nothing. Never raises.
+        """
+        found: list[tuple[str, Level]] = []
+        if self._view is None:
+            return found
+        for name, rule in self._levelled:
+            # What is only shown disturbs nothing.
+            with suppress(Exception):
+                found += [(name, level) for level in rule.levels(self._view, NO_MARKS)]
+        return found
+
     def reset(self, token: OperatorToken, view: CellView, alarms: Sequence[Violation] = ()) -> ResetDone | ResetRefused:
         """Clear the latch at an operator's request, judged on the current ``view`` and ``alarms``; nothing moves."""
         self._latch.update((*alarms, *self._violations(view)))
+        self._rest.note(view)
         outcome = self._latch.reset(
             token,
-            at_rest=all(self._at_rest(name, arm.state.value.twist) for name, arm in view.arms.items()),
+            at_rest=self._rest.at_rest(view),
             commanded=any(arm.command is not None and np.any(arm.command.twist) for arm in view.arms.values()),
         )
         if isinstance(outcome, ResetDone):
@@ -176,28 +188,6 @@ class Supervisor:
             else v
             for v in found
         )
-
-    def _at_rest(self, name: str, twist: np.ndarray) -> bool:
-        linear, angular = np.linalg.norm(twist[:3]), np.linalg.norm(twist[3:])
-        return bool(linear <= self._rest_m_s and angular <= self._rest_rad_s) or self._has_stood(name)
-
-    def _has_stood(self, name: str) -> bool:
-        """Return whether the positions of the last half a second stay within what the speeds at rest would allow.
-
-        Motors that report speed in steps of some mrad/s never report 0: a speed of 12 bits is coarser than 1 mm/s at
-        the tool, a position of 16 bits is not.
-        """
-        seen = self._seen.get(name)
-        if seen is None or len(seen) < _FEWEST_SEEN or seen[-1].t_ns - seen[0].t_ns < _STOOD_FOR_NS:
-            return False
-        window_s = 1e-9 * (seen[-1].t_ns - seen[0].t_ns)
-        poses = np.array([state.value.T_base_tcp for state in seen])
-        if not np.isfinite(poses).all():
-            return False
-        moved_m = np.linalg.norm(poses[:, :3, 3] - poses[0, :3, 3], axis=1).max()
-        # |R - R0| is sqrt(8) sin(angle/2) in the Frobenius norm.
-        turned_rad = np.linalg.norm(poses[:, :3, :3] - poses[0, :3, :3], axis=(1, 2)).max() / np.sqrt(2.0)
-        return bool(moved_m <= self._rest_m_s * window_s and turned_rad <= self._rest_rad_s * window_s)
 
 
 def _checked(interlock: Interlock, view: CellView) -> Violation | None:

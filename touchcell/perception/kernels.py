@@ -37,7 +37,7 @@ def _in_rows(image: ImageArray) -> ImageArray:
 
 
 def compiled() -> bool:
-    """Return True if the compiled extension is there."""
+    """Return True if the compiled extension is installed."""
     return _FOUND is not None
 
 

@@ -27,8 +27,9 @@ static PyObject *paint(PyObject *module, PyObject *const *arguments, Py_ssize_t 
     PyArrayObject *centres = count == 3 ? array_of(arguments[1], NPY_DOUBLE, 2) : NULL;
     PyArrayObject *stamps = count == 3 ? array_of(arguments[2], NPY_UBYTE, 4) : NULL;
     if (!image || !centres || !stamps || !PyArray_ISWRITEABLE(image) || PyArray_DIM(centres, 1) != 2 ||
-        PyArray_DIM(stamps, 0) != PyArray_DIM(stamps, 1) || PyArray_DIM(stamps, 2) != PyArray_DIM(stamps, 3)) {
-        PyErr_SetString(PyExc_TypeError, "paint takes a picture (h, w), centres (n, 2) and stamps (p, p, s, s)");
+        PyArray_DIM(stamps, 0) != PyArray_DIM(stamps, 1) || PyArray_DIM(stamps, 2) != PyArray_DIM(stamps, 3) ||
+        PyArray_DIM(stamps, 0) < 1) {
+        PyErr_SetString(PyExc_TypeError, "paint takes a picture (h, w), centres (n, 2) and stamps (p, p, s, s), p > 0");
         return NULL;
     }
     npy_intp height = PyArray_DIM(image, 0), width = PyArray_DIM(image, 1);
@@ -102,7 +103,8 @@ static PyObject *expose(PyObject *module, PyObject *const *arguments, Py_ssize_t
     if (PyErr_Occurred())
         return NULL;
     npy_intp height = PyArray_DIM(layers[0], 0), width = PyArray_DIM(layers[0], 1), stride = PyArray_DIM(noise, 1);
-    if (top < 0 || left < 0 || top + height > PyArray_DIM(noise, 0) || left + width > stride) {
+    /* So written, no sum can overflow. */
+    if (top < 0 || left < 0 || top > PyArray_DIM(noise, 0) - height || left > stride - width) {
         PyErr_SetString(PyExc_ValueError, "the window leaves the noise");
         return NULL;
     }

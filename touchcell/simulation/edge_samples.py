@@ -16,7 +16,7 @@ import numpy as np
 
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
-from touchcell.simulation.contact import ContactLaw
+from touchcell.simulation.contact import ContactLaw, about_z
 from touchcell.simulation.edges import nearest_edge
 from touchcell.simulation.meshes.mesh_shape import MeshShape
 from touchcell.simulation.pressed import pressed
@@ -29,6 +29,7 @@ _IMAGES_PER_TIP: Final = 32
 _CREASE_RAD: Final = math.radians(30.0)
 _NEAR_CORNER: Final = 0.3
 _CORNER_RAD: Final = math.radians(15.0)
+_ALONG: Final = 0.5
 _ALONG_MM: Final = 0.1
 """Along the edge nothing is felt: a label within a tenth of a millimetre keeps its scale from being zero."""
 
@@ -42,14 +43,17 @@ class EdgeRanges:
         depth_mm: smallest and largest.
         tilt_deg: largest about either axis.
         turn_deg: largest about the normal.
-        shear_mm: largest, in any direction.
+        shear_mm: the longest way that the tip is dragged, in any direction or, for half of them, along the edge
+            alone. It is longer than the skin holds: a tip that follows an edge always slips.
+        torsion_deg: the largest turn about the normal on that way, likewise: along a bend the skin is always twisted.
     """
 
     offset_mm: float = 8.0
     depth_mm: tuple[float, float] = (0.2, 7.0)
     tilt_deg: float = 12.0
     turn_deg: float = 75.0
-    shear_mm: float = 3.5
+    shear_mm: float = 6.0
+    torsion_deg: float = 8.0
 
     def drawn(self, rng: np.random.Generator) -> Array:
         """Return a random contact (6,) mm and deg."""
@@ -94,7 +98,7 @@ def _contact(
     """Return T_e_s (4, 4) and pixels (markers, 2) of a contact within the ranges."""
     surface, radius_m = Surface(shape), law.tip_radius_m
     while True:
-        T_world_e = _somewhere(shape, surface, radius_m, rng)
+        T_world_e = frame_on_rim(shape, surface, radius_m, rng)
         T_world_s = se3.compose(T_world_e, se3.from_euler_mm_deg(ranges.drawn(rng)))
         # Beside corners and on bends the edge that the tip feels is not the one that it was placed at.
         felt = nearest_edge([surface], T_world_s, 0.0, radius_m)
@@ -102,19 +106,21 @@ def _contact(
         label = se3.to_euler_mm_deg(se3.compose(se3.inverse(felt), T_world_s))
         if not ranges.holds(label):
             continue
-        state, pixels = pressed(surface, tip, law, _sheared(T_world_e, T_world_s, ranges, rng), T_world_s)
+        state, pixels = pressed(surface, tip, law, dragged_to(T_world_e, T_world_s, ranges, rng), T_world_s)
         if not state.in_contact:
             continue
         label[1] = rng.uniform(-_ALONG_MM, _ALONG_MM)
         return se3.from_euler_mm_deg(label), pixels
 
 
-def _somewhere(shape: MeshShape, surface: Surface, radius_m: float, rng: np.random.Generator) -> Array:
-    """Return the frame {e} (4, 4) of a random point of the rim, often near a corner."""
+def frame_on_rim(
+    shape: MeshShape, surface: Surface, radius_m: float, rng: np.random.Generator, *, at_corners: float = _NEAR_CORNER
+) -> Array:
+    """Return the frame {e} (4, 4) of a random point of the rim, near a corner with a probability of ``at_corners``."""
     edges = shape.edges
     upper = np.flatnonzero(edges.middle_normals[:, :, 2].max(axis=1) > math.cos(math.radians(50.0)))
     sides = edges.ends - edges.starts
-    if rng.random() < _NEAR_CORNER:
+    if rng.random() < at_corners:
         units = sides / np.linalg.norm(sides, axis=1, keepdims=True)
         bends = np.einsum("kc,kc->k", units[upper], np.roll(units[upper], -1, axis=0))
         corners = upper[np.abs(bends) < math.cos(_CORNER_RAD)]
@@ -136,9 +142,14 @@ def _with_z(z: Array) -> Array:
     return np.stack([x, np.cross(z, x), z], axis=1)
 
 
-def _sheared(T_world_e: Array, T_world_s: Array, ranges: EdgeRanges, rng: np.random.Generator) -> Array:
-    """Return from where a contact is dragged to ``T_world_s`` along the face."""
-    angle, length = rng.uniform(0.0, 2.0 * math.pi), 1e-3 * ranges.shear_mm * rng.random()
+def dragged_to(T_world_e: Array, T_world_s: Array, ranges: EdgeRanges, rng: np.random.Generator) -> Array:
+    """Return from where a contact is dragged to ``T_world_s`` along the face, and turned about its normal."""
+    along = rng.random() < _ALONG
+    angle = rng.choice([-0.5, 0.5]) * math.pi if along else rng.uniform(0.0, 2.0 * math.pi)
+    length = 1e-3 * ranges.shear_mm * rng.random()
+    torsion = math.radians(ranges.torsion_deg) * rng.uniform(-1.0, 1.0)
+    R = T_world_e[:3, :3]
     T = T_world_s.copy()
-    T[:3, 3] -= T_world_e[:3, :3] @ np.array([length * math.cos(angle), length * math.sin(angle), 0.0])
+    T[:3, :3] = R @ about_z(-torsion) @ R.T @ T_world_s[:3, :3]
+    T[:3, 3] -= R @ np.array([length * math.cos(angle), length * math.sin(angle), 0.0])
     return T

@@ -78,7 +78,7 @@ class MeshConfig(MeshSurfaceConfig):
 
     Attributes:
         file: the mesh, beside the cell file.
-        unit: of its coordinates, which no mesh file tells.
+        unit: of its coordinates, which no mesh file declares.
         scale: factor on the mesh, as for one that was normalised to a size of 1.
         repair: close small holes, orient all faces, and use what stays open as a sheet.
     """

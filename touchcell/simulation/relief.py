@@ -21,6 +21,10 @@ _STEP_RAD: Final = math.radians(11.0)
 _WIDTH_RAD: Final = math.radians(11.0)
 _REACH_M: Final = 6e-3
 """Skin further than this above the tangent plane is not asked about: it touches in narrow hollows only."""
+_THIN: Final = 0.98
+"""Share of its depth below the tangent plane, below which skin may have come through a wall."""
+_OTHER_SIDE_COS: Final = -0.3
+_CLEAR_M: Final = 1e-3
 
 
 @runtime_checkable
@@ -103,5 +107,11 @@ def felt_relief(surface: Surface, T_world_s: Array, t_s: float, directions: Arra
         distances[asked] = shape.distances(points[asked])
     else:
         distances[asked] = [shape.nearest(p).distance_m for p in points[asked]]
-    relief: Array = np.maximum(-distances, 0.0) - np.maximum(-above, 0.0)
+    pressed_in = np.maximum(-distances, 0.0)
+    # Within a wall that is thinner than the tip presses in, the nearest surface is the other side of the wall.
+    for i in np.flatnonzero(pressed_in < _THIN * -above):
+        if float(shape.nearest(points[i]).normal @ nearest.normal) < _OTHER_SIDE_COS:
+            outside_m = -above[i] + _CLEAR_M
+            pressed_in[i] = max(outside_m - shape.nearest(points[i] + outside_m * nearest.normal).distance_m, 0.0)
+    relief: Array = pressed_in - np.maximum(-above, 0.0)
     return relief

@@ -6,12 +6,13 @@ import math
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 from pydantic import Field, PositiveFloat, model_validator
 
-from touchcell.drivers.core.clock import Clock
+from touchcell.drivers.core.clock import Clock, VirtualClock
 from touchcell.drivers.core.errors import DeviceError
 from touchcell.drivers.core.protocols import TcpSource
 from touchcell.drivers.core.samples import Stamped
@@ -20,6 +21,7 @@ from touchcell.errors import ConfigError, TouchcellError
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 from touchcell.plugin_section import Section
+from touchcell.simulation.ahead import remark_on_approach
 from touchcell.simulation.bodies import scene_bodies
 from touchcell.simulation.closed_forms import Box, Cylinder, Saddle
 from touchcell.simulation.contact import ContactLaw
@@ -109,6 +111,7 @@ class Scene:
         step_s: step of the simulation grid.
         surfaces: those of the world, for what only pictures and edges need of them.
         tip_radius_m: of every tip.
+        feels_shape: whether cameras show what curvature and edges change; see ``SceneConfig.feels``.
     """
 
     def __init__(
@@ -118,10 +121,12 @@ class Scene:
         step_s: float = DEFAULT_STEP_S,
         surfaces: Sequence[Surface] = (),
         tip_radius_m: float = 0.020,
+        feels_shape: bool = False,
     ) -> None:
         self.world = world
         self.surfaces = tuple(surfaces)
         self.tip_radius_m = tip_radius_m
+        self.feels_shape = feels_shape
         self.timeline = Timeline(clock, step_s)
         self._start_ns = self.timeline.t_ns
         self._poses: dict[str, Callable[[], Array]] = {}
@@ -414,6 +419,8 @@ class SceneConfig(Section, SceneSection):
         tip: contact law of the simulated tips.
         step_ms: grid on which arms move and contacts are stored.
         physics_step_ms: step of the dynamics, a divisor of ``step_ms``.
+        feels: what the simulated and emulated cameras of real drivers show: ``plane`` or ``shape``, as the key of
+            ``sim_tactip``.
     """
 
     physics: Literal["kinematic", "quasi_static", "dynamic"] = "kinematic"
@@ -423,6 +430,7 @@ class SceneConfig(Section, SceneSection):
     tip: TipLawConfig = TipLawConfig()
     step_ms: float = Field(default=2.0, ge=0.1, le=10.0)
     physics_step_ms: float = Field(default=1.0, ge=0.05, le=5.0)
+    feels: Literal["plane", "shape"] = "plane"
 
     @model_validator(mode="after")
     def _something_to_touch(self) -> SceneConfig:
@@ -447,7 +455,12 @@ class SceneConfig(Section, SceneSection):
         """Build the scene; its motions start now."""
         surfaces = {name: config.build() for name, config in self.surfaces.items()}
         return Scene(
-            self._world(surfaces), clock, self.step_ms * 1e-3, list(surfaces.values()), 1e-3 * self.tip.radius_mm
+            self._world(surfaces),
+            clock,
+            self.step_ms * 1e-3,
+            list(surfaces.values()),
+            1e-3 * self.tip.radius_mm,
+            self.feels == "shape",
         )
 
     def modules(self) -> Mapping[str, tuple[str, str]]:
@@ -464,11 +477,34 @@ class SceneConfig(Section, SceneSection):
                 key = f"surfaces.{name}.{problem.key}"
                 yield ConfigError(problem.reason, key=key, value=problem.value, hint=problem.hint)
 
-    def remarks(self) -> Iterable[str]:
-        """Yield where the tip does not fit into a surface."""
+    def pressed(self, tips: Mapping[str, Array]) -> Mapping[str, float]:
+        """Return how deep each tip is in a surface or an object; {} for dynamic scenes, which take long to build."""
+        if self.physics == "dynamic":
+            return {}
+        scene = self.build(VirtualClock())
+        for sensor, T_world_s in tips.items():
+            scene.mount(sensor, partial(np.asarray, T_world_s))
+        depths_m = {sensor: float(scene.contact(sensor).value.T_f_s[2, 3]) for sensor in tips}
+        return {sensor: depth_m for sensor, depth_m in depths_m.items() if depth_m > 0.0}
+
+    def has_edges(self) -> bool:
+        """Return whether a surface has an edge."""
+        surfaces = [surface.build() for surface in self.surfaces.values()]
+        return nearest_edge(surfaces, np.eye(4), 0.0, 1e-3 * self.tip.radius_mm) is not None
+
+    def remarks(self, starts: Mapping[str, Array], reach_m: float | None) -> Iterable[str]:
+        """Yield where the tip does not fit into a surface, and which sensor does not come upon one."""
+        radius_m = 1e-3 * self.tip.radius_mm
         for name, surface in self.surfaces.items():
-            for remark in surface.remarks(1e-3 * self.tip.radius_mm):
+            for remark in surface.remarks(radius_m):
                 yield f"scene.surfaces.{name}: {remark}"
+        # A sensor may be there for a free object, which none of the surfaces is.
+        if reach_m is None or self.objects:
+            return
+        surfaces = {name: surface.build() for name, surface in self.surfaces.items()}
+        for sensor, T_world_s in starts.items():
+            if ahead := remark_on_approach(surfaces, T_world_s, radius_m, reach_m):
+                yield f"sensors.{sensor}: {ahead}"
 
     def _world(self, surfaces: Mapping[str, Surface]) -> World:
         if self.physics == "kinematic":

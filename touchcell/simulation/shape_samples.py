@@ -49,7 +49,7 @@ def shape_contacts(
     variation, law = variation or Variation(), ContactLaw()
     for start in range(0, n, _IMAGES_PER_TIP):
         tip = Tip(scattered(TipParameters(), variation, rng))
-        surface = _random_surface(rng)
+        surface = random_curved_surface(rng, ridges=_RIDGES)
         for _ in range(min(_IMAGES_PER_TIP, n - start)):
             T_f_s, pixels = _contact(surface, tip, law, depth_mm, rng)
             pixels = pixels + rng.normal(0.0, variation.marker_px, pixels.shape)
@@ -58,14 +58,15 @@ def shape_contacts(
             yield SampledContact(T_f_s, pixels, seen, float(radius))
 
 
-def _random_surface(rng: np.random.Generator) -> Surface:
+def random_curved_surface(rng: np.random.Generator, *, ridges: float = 0.0) -> Surface:
+    """Return a plane or a surface that bends both ways; a share of ``ridges`` of those has a ridge in its middle."""
     if rng.random() < _PLANES:
         return Surface(Plane())
     # Convex is negative: heights fall away from the middle.
     low, high = -_CONVEX_PER_M, _HOLLOW_PER_M
     curvature = rng.uniform(low, high, 2) * rng.random()
     turn, along_x = rng.uniform(0.0, math.pi), rng.random() < 0.5
-    slope = rng.uniform(0.0, _STEEPEST_RIDGE) if rng.random() < _RIDGES else 0.0
+    slope = rng.uniform(0.0, _STEEPEST_RIDGE) if rng.random() < ridges else 0.0
     side = (np.arange(_POINTS) - 0.5 * (_POINTS - 1)) * _SPACING_M
     x, y = np.meshgrid(side, side)
     u, v = math.cos(turn) * x + math.sin(turn) * y, math.cos(turn) * y - math.sin(turn) * x

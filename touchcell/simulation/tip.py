@@ -38,6 +38,7 @@ class TipParameters:
         focal_px: focal length.
         centre_px: (u, v) of the optical axis in the 640x480 frame; pixel centres are whole numbers.
         image_rotation_rad: rotation from sensor axes to image axes about z.
+        mirrored: the camera sees the skin in a mirror: the image is reversed about its vertical axis.
         camera_tilt_rad: rotation of the markers about the sensor's x, then y axis, in the view of a camera whose
             optical axis is not the sensor's axis.
         disc_radius_px: radius of the markers in the image.
@@ -71,6 +72,7 @@ class TipParameters:
     focal_px: float = 501.1
     centre_px: tuple[float, float] = (331.05, 241.5)
     image_rotation_rad: float = -51.6 * _DEG
+    mirrored: bool = False
     camera_tilt_rad: tuple[float, float] = (0.0, 0.0)
     disc_radius_px: float = 6.2
     follow: float = 1.0
@@ -190,7 +192,8 @@ class Tip:
         scale = p.focal_px / (p.camera_distance_m + positions[..., 2])
         sin, cos = math.sin(p.image_rotation_rad), math.cos(p.image_rotation_rad)
         x, y = positions[..., 0], positions[..., 1]
-        u = p.centre_px[0] + scale * (cos * x - sin * y)
+        across = scale * (cos * x - sin * y)
+        u = p.centre_px[0] + (-across if p.mirrored else across)
         v = p.centre_px[1] + scale * (sin * x + cos * y)
         return np.stack([u, v], axis=-1)
 

@@ -13,6 +13,7 @@ from touchcell.control.pid import PidGains
 from touchcell.control.servo import TactileServo
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
+from touchcell.perception.features.feature_model import TouchedFeature
 from touchcell.perception.runtime.estimate import ContactEstimate
 from touchcell.tasks.free_motion import Goal
 from touchcell.tasks.interface import Observation, TaskConfig, TaskContext
@@ -85,6 +86,20 @@ class Sidestepping(Protocol):
 
     def begin_approach(self, T_base_sensor: Array) -> None:
         """Take note of the pose (4, 4) from which the sensor approaches along its axis."""
+        ...
+
+
+@runtime_checkable
+class NeedsFeature(Protocol):
+    """Behavior that continues only along what it is made for, such as an edge."""
+
+    def astray(self, dt_s: float, touched: TouchedFeature | None) -> str:
+        """Return why the behavior cannot continue; empty where it can.
+
+        Args:
+            dt_s: duration of the cycle.
+            touched: what a classifier says of the newest frame, or None without one.
+        """
         ...
 
 

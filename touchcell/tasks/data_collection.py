@@ -2,6 +2,10 @@
 
 For each sample the sensor tilts out of contact, is pressed in along the surface normal, sheared along the surface, and
 rests while a frame is taken. The cell stores frame and label.
+
+With ``motions: sequence`` it is pressed in and then moves from one random contact to the next without leaving the
+surface, so that the skin sticks and slides as it comes, and every frame is stored with where the sensor was. Each
+sequence begins with frames out of contact, whose depth is negative.
 """
 
 from __future__ import annotations
@@ -9,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum, auto
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
@@ -22,6 +26,7 @@ from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 from touchcell.perception.contact_poses import PUBLIC_DEPTH_MM, random_poses
 from touchcell.perception.runtime.estimate import ContactEstimate
+from touchcell.perception.runtime.motion import PoseHistory
 from touchcell.tasks.interface import (
     DEPTH,
     SPEED,
@@ -45,7 +50,7 @@ class DataCollectionConfig(TaskConfig):
 
     Attributes:
         samples: number of samples to collect, including those of earlier runs.
-        seed: of the contacts; sample k is the same whenever it is taken.
+        seed: of the contacts; a single sample k is the same whenever it is taken.
         depth_mm: smallest and largest indentation.
         tilt_deg: radius of the disc of tilts.
         shear_mm: radius of the disc of shears.
@@ -55,6 +60,8 @@ class DataCollectionConfig(TaskConfig):
         press_speed_mm_s: speed in contact.
         turn_deg_s: angular rate.
         settle_ms: time at rest before a frame is used.
+        motions: ``single`` takes one frame of each contact, at rest; ``sequence`` all frames of contacts that move.
+        sequence_frames: frames of a sequence, after which the sensor leaves the surface.
         move_timeout_s: longest time of each motion.
         max_frame_age_ms: the arm stops when the newest frame is older.
         max_state_age_ms: the arm stops when its newest state is older.
@@ -72,6 +79,8 @@ class DataCollectionConfig(TaskConfig):
     press_speed_mm_s: Annotated[PositiveFloat, SPEED] = 15.0
     turn_deg_s: PositiveFloat = 60.0
     settle_ms: NonNegativeFloat = 50.0
+    motions: Literal["single", "sequence"] = "single"
+    sequence_frames: PositiveInt = 200
     move_timeout_s: PositiveFloat = 10.0
     max_frame_age_ms: PositiveFloat = 250.0
     max_state_age_ms: PositiveFloat = 50.0
@@ -87,6 +96,7 @@ class CollectState(Enum):
     PRESS = auto()
     SHEAR = auto()
     GRAB = auto()
+    ROAM = auto()
     RETRACT = auto()
     DONE = auto()
     STOPPED = auto()
@@ -95,7 +105,14 @@ class CollectState(Enum):
     FAULTED = auto()
 
 
-_MOVING = (CollectState.LIFT, CollectState.TILT, CollectState.PRESS, CollectState.SHEAR, CollectState.RETRACT)
+_MOVING = (
+    CollectState.LIFT,
+    CollectState.TILT,
+    CollectState.PRESS,
+    CollectState.SHEAR,
+    CollectState.ROAM,
+    CollectState.RETRACT,
+)
 
 
 def collect_table(config: DataCollectionConfig) -> Table:
@@ -111,6 +128,7 @@ def collect_table(config: DataCollectionConfig) -> Table:
             StateDef(s.PRESS, longest_s, "timeout", on_enter="aim_press"),
             StateDef(s.SHEAR, longest_s, "timeout", on_enter="aim_shear"),
             StateDef(s.GRAB, longest_s, "timeout", on_enter="start_grab"),
+            StateDef(s.ROAM, longest_s, "timeout", on_enter="aim_next"),
             StateDef(s.RETRACT, longest_s, "timeout", on_enter="withdraw"),
             StateDef(s.DONE, terminal=True),
             StateDef(s.STOPPED, terminal=True),
@@ -125,9 +143,12 @@ def collect_table(config: DataCollectionConfig) -> Table:
             TransitionDef("arrived", s.LIFT, s.TILT, guard="more_to_take"),
             TransitionDef("arrived", s.LIFT, s.RETRACT),
             TransitionDef("arrived", s.TILT, s.PRESS),
+            TransitionDef("arrived", s.PRESS, s.ROAM, guard="in_sequence"),
             TransitionDef("arrived", s.PRESS, s.SHEAR),
             TransitionDef("arrived", s.SHEAR, s.GRAB),
             TransitionDef("taken", s.GRAB, s.LIFT),
+            TransitionDef("arrived", s.ROAM, s.ROAM),
+            TransitionDef("taken", s.ROAM, s.LIFT),
             TransitionDef("arrived", s.RETRACT, s.STOPPED, guard="was_stopped"),
             TransitionDef("arrived", s.RETRACT, s.FAILED, guard="more_to_take"),
             TransitionDef("arrived", s.RETRACT, s.DONE),
@@ -180,6 +201,10 @@ class DataCollection(MachineTask):
         self._T_base_f: Array | None = None
         self._goal: Array | None = None
         self._taken = context.kept
+        self._begun = context.kept
+        self._leg = 0
+        self._labelled = -1
+        self._poses = PoseHistory()
         self._arrived_ns = 0
         self._blind_since_ns: int | None = None
         self._stop_seen = False
@@ -206,6 +231,10 @@ class DataCollection(MachineTask):
         """Guard: samples are missing."""
         return self._taken < self._config.samples
 
+    def in_sequence(self) -> bool:
+        """Guard: frames are taken in motion."""
+        return self._config.motions == "sequence"
+
     def was_stopped(self) -> bool:
         """Guard: the operator requested a stop."""
         return self._stop_seen
@@ -216,6 +245,7 @@ class DataCollection(MachineTask):
 
     def aim_tilt(self, record: TransitionRecord) -> None:
         """On entry: the next sample's tilt, above its contact point."""
+        self._begun, self._leg = self._taken, 0
         _, _, _, alpha, beta, _ = self._sample()
         self._aim([0.0, 0.0, -self._config.clearance_mm, alpha, beta, 0.0])
 
@@ -228,6 +258,11 @@ class DataCollection(MachineTask):
         """On entry: shear along the surface."""
         self._aim(self._sample())
 
+    def aim_next(self, record: TransitionRecord) -> None:
+        """On entry: the next contact of the sequence."""
+        self._leg += 1
+        self._aim(self._sample())
+
     def start_grab(self, record: TransitionRecord) -> None:
         """On entry: rest, and start the settling time."""
         self._arrived_ns = record.t_ns
@@ -235,9 +270,10 @@ class DataCollection(MachineTask):
     def _sample(self) -> list[float]:
         """Return the contact T_f_s of the current sample, mm and degrees."""
         config = self._config
+        number = (self._begun, self._leg) if self.in_sequence() else (self._taken,)
         T_f_s = random_poses(
             1,
-            np.random.default_rng((config.seed, self._taken)),
+            np.random.default_rng((config.seed, *number)),
             config.depth_mm,
             tilt_deg=config.tilt_deg,
             shear_mm=config.shear_mm,
@@ -256,6 +292,7 @@ class DataCollection(MachineTask):
         T_base_s = None
         if arm is not None and 0.0 <= arm.age_s(now_ns) <= 1e-3 * config.max_state_age_ms:
             T_base_s = se3.compose(arm.value.T_base_tcp, self._T_tcp_sensor)
+            self._poses.record(arm.t_ns, T_base_s)
         if contact is not None and not 0.0 <= now_ns - contact.t_frame_ns <= 1e6 * config.max_frame_age_ms:
             contact = None
         return _Sight(now_ns, T_base_s, contact)
@@ -281,10 +318,32 @@ class DataCollection(MachineTask):
                     self._taken += 1
                     self._post("taken")
                     return {SENSOR: se3.inverse(sight.T_s_f)}
+            case CollectState.PRESS | CollectState.ROAM if self.in_sequence():
+                labels = self._labels_in_motion(sight.contact)
+                if state is CollectState.ROAM and self._sequence_taken():
+                    self._post("taken")
+                elif self._is_there(sight.T_base_s):
+                    self._post("arrived")
+                return labels
             case _:
-                if self._goal is not None and is_there(sight.T_base_s, self._goal, _WITHIN_M, _WITHIN_RAD):
+                if self._is_there(sight.T_base_s):
                     self._post("arrived")
         return {}
+
+    def _is_there(self, T_base_s: Array) -> bool:
+        return self._goal is not None and is_there(T_base_s, self._goal, _WITHIN_M, _WITHIN_RAD)
+
+    def _sequence_taken(self) -> bool:
+        return self._taken - self._begun >= self._config.sequence_frames or not self.more_to_take()
+
+    def _labels_in_motion(self, contact: ContactEstimate | None) -> Mapping[str, Array]:
+        """Return the label of a frame that has none yet: where the sensor was when it was taken."""
+        assert self._T_base_f is not None
+        if contact is None or contact.seq == self._labelled or self._sequence_taken():
+            return {}
+        self._labelled = contact.seq
+        self._taken += 1
+        return {SENSOR: se3.compose(se3.inverse(self._T_base_f), self._poses.at(contact.t_frame_ns))}
 
     def _watch_sight(self, *, blind: bool) -> None:
         now_ns = self._sight.now_ns

@@ -206,4 +206,6 @@ SPEC = TaskSpec(
     },
     sensors=frozenset({LEADER_SENSOR, FOLLOWER_SENSOR}),
     build=build,
+    starts_free=True,
+    places=lambda config, start, mount: config.planned_places(LEADER),
 )

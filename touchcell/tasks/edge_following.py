@@ -17,6 +17,8 @@ from touchcell.control.curvature import CurvatureEstimator
 from touchcell.control.pid import PidGains
 from touchcell.drivers.core.protocols import SERVO_ARM
 from touchcell.geometry.types import Array
+from touchcell.perception.features.feature_model import TouchedFeature
+from touchcell.perception.runtime.feature_spec import EDGE
 from touchcell.tasks.contact_servo import ContactServo, SixGains
 from touchcell.tasks.interface import DEPTH, SPEED, TaskContext, TaskSpec
 from touchcell.tasks.servoing import ARM, SENSOR, ServoConfig, ServoTask
@@ -31,6 +33,8 @@ _AXES: Final = {
 
 _BEND_SHARE: Final = 0.6
 """Of the largest turn that a bend may take, so that corrections have the rest."""
+_NO_EDGE_S: Final = 0.1
+"""Without an edge before anything is followed: three frames, before the controller goes where it seems to be."""
 _FASTEST_TILT_RAD_S: Final = 1.0
 """Of the tilt that is fed forward."""
 
@@ -49,6 +53,9 @@ class EdgeFollowingConfig(ServoConfig):
         close_loop: end where the edge leads back to where it began, and fail where it does not.
         bend_window_mm: the turn of the edge over this last stretch is fed forward.
         closing_mm: distance from there at which the loop is closed.
+        least_edge_percent: probability of an edge, corners included, below which the task does not begin, and fails;
+            judged only where the sensor's estimator has a classifier (``features:``).
+        edge_lost_ms: time for which it has to stay below.
     """
 
     depth_mm: Annotated[PositiveFloat, DEPTH] = 3.0
@@ -66,6 +73,8 @@ class EdgeFollowingConfig(ServoConfig):
     distance_mm: PositiveFloat = 100.0
     close_loop: bool = False
     closing_mm: PositiveFloat = 3.0
+    least_edge_percent: float = Field(default=50.0, ge=0.0, le=100.0)
+    edge_lost_ms: PositiveFloat = 300.0
     return_lift_mm: PositiveFloat | None = 3.0
 
     def gains(self) -> PidGains:
@@ -102,6 +111,10 @@ class FollowEdge:
         self._travelled_m = 0.0
         self._away = False
         self._closed = False
+        self._least_edge = 1e-2 * config.least_edge_percent
+        self._edge_lost_s = 1e-3 * config.edge_lost_ms
+        self._off_edge_s = 0.0
+        self._edge = math.nan
 
     @property
     def feedforward(self) -> Array:
@@ -140,6 +153,20 @@ class FollowEdge:
             self._closed = self._away and from_start <= self._closing_m
         return self._closed or self._travelled_m >= self._distance_m
 
+    def astray(self, dt_s: float, touched: TouchedFeature | None) -> str:
+        """Return that there is no edge, or none any more, once it has been missing for a while."""
+        if touched is None:
+            return ""
+        self._edge = touched.along_an_edge
+        self._off_edge_s = self._off_edge_s + dt_s if self._edge < self._least_edge else 0.0
+        longest_s = min(self._edge_lost_s, _NO_EDGE_S) if self._start is None else self._edge_lost_s
+        if self._off_edge_s <= longest_s:
+            return ""
+        what = f"{touched.likeliest} by {100.0 * getattr(touched, touched.likeliest):.0f} %"
+        if self._start is None:
+            return f"touches no edge to follow: {what}"
+        return f"lost the edge after {1e3 * self._travelled_m:.0f} mm: {what}"
+
     def shortfall(self) -> str:
         """Return that a loop that was to be closed is not."""
         if self._close_loop and not self._closed:
@@ -148,13 +175,14 @@ class FollowEdge:
 
     def telemetry(self) -> Mapping[str, float]:
         """Return the way along the edge so far."""
-        return {"along_edge_mm": 1e3 * self._travelled_m}
+        values = {"along_edge_mm": 1e3 * self._travelled_m}
+        return values if math.isnan(self._edge) else {**values, "edge_percent": 100.0 * self._edge}
 
 
 def _build(config: EdgeFollowingConfig, context: TaskContext) -> ServoTask:
     reference = (config.offset_mm, 0.0, config.depth_mm, 0.0, 0.0, 0.0)
     axes = _AXES[config.dimensions]
-    servo = ContactServo(ARM, SENSOR, config, reference, FollowEdge(config), context, axes, decoupled=True)
+    servo = ContactServo(ARM, SENSOR, config, reference, FollowEdge(config), context, axes, decoupled=EDGE.decoupled)
     return ServoTask("edge_following", config, context, servo, shears=False)
 
 
@@ -165,5 +193,6 @@ SPEC = TaskSpec(
     {ARM: SERVO_ARM},
     frozenset({SENSOR}),
     _build,
-    feature="edge",
+    starts_free=True,
+    feature=EDGE.name,
 )

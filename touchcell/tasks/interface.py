@@ -6,7 +6,7 @@ supervisor, and sends what it allows. So every task is tested with plain data an
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final, Generic, Literal, Protocol, TypeAlias, TypeVar
 
@@ -20,6 +20,7 @@ from touchcell.geometry.types import Array
 from touchcell.perception.runtime.estimate import ContactEstimate
 from touchcell.perception.runtime.estimator_spec import Feature
 from touchcell.registry import Registry
+from touchcell.tasks.planned_places import PlannedPlace
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,6 +192,9 @@ class TaskSpec(Generic[TaskConfigT]):
         devices: roles of other devices, and the Protocols that each driver must provide.
         forces: returns roles of arms whose wrench a configuration needs, each with the key that needs it; their drivers
             must provide WrenchSource.
+        places: returns where a configuration surely takes an arm, for `touchcell check`, given the pose (4, 4) at which
+            the sensor's arm starts, None if that is not known, and the sensor's mount (4, 4).
+        starts_free: True if its sensors must not touch anything when it begins.
         feature: what the contacts of its sensors must be of; None for a task to which it is the same.
         of_cell: returns the spec with the roles of a cell, for a task whose arms and sensors are those that the cell
             has: called with the roles of the arms and of the sensors that ``task:`` names, or else with all of them.
@@ -205,6 +209,8 @@ class TaskSpec(Generic[TaskConfigT]):
     labels_frames: bool = False
     devices: Mapping[str, frozenset[type]] = field(default_factory=dict)
     forces: Callable[[TaskConfigT], Mapping[str, str]] | None = None
+    starts_free: bool = False
+    places: Callable[[TaskConfigT, Array | None, Array], Iterable[PlannedPlace]] | None = None
     feature: Feature | None = "surface"
     of_cell: Callable[[frozenset[str], frozenset[str]], TaskSpec[TaskConfigT]] | None = None
 

@@ -1,7 +1,7 @@
 """After first contact: a small known motion whose measured answer must agree with it before the arm servos.
 
 A camera that is mounted turned or mirrored, or a model of another sensor, gives estimates that look like any others.
-Servoing on them, the arm runs away: every correction enlarges the error. What tells is motion. The sensor is pressed
+Servoing on them, the arm runs away: every correction enlarges the error. Only motion shows it. The sensor is pressed
 on, then shifted and tilted by amounts that any surface bears, along one axis after the other, and the estimates of
 single frames are regressed on the motion of the arm: answer = a motion + b conj(motion) + c + d t, for shear and tilt
 as complex numbers. A right sensor has a near 1 and b near 0; the angle of a is that of a turned camera; in a mirror b
@@ -29,6 +29,8 @@ _MOST_TURN_DEG = 30.0
 _OPPOSITE_DEG = 90.0
 _PRESS_SHARE = 0.15
 _BACK_PER_S = 10.0
+_BACK_PER_S2 = 25.0
+_MOST_DRAG = np.array([2e-3] * 3 + [math.radians(2.0)] * 3)
 _BACK_S = 0.2
 _BEHIND_M, _BEHIND_RAD = 0.1e-3, math.radians(0.2)
 
@@ -81,6 +83,7 @@ class SensorCheck:
         self._seq = -1
         self._t_s = 0.0
         self._start: Array | None = None
+        self._drag = np.zeros(6)
 
     @property
     def finished(self) -> bool:
@@ -101,7 +104,8 @@ class SensorCheck:
         """Advance by a cycle and return the sensor's twist (6,) in its own frame.
 
         Where the arm falls behind, as where an interlock slows it in one direction, the motion waits for it, so that
-        the sensor moves as far as it should and ends where it began.
+        the sensor moves as far as it should and ends where it began. A surface that moves drags a compliant arm along:
+        that is integrated.
         """
         if self._start is None:
             self._start = T_base_sensor
@@ -109,7 +113,8 @@ class SensorCheck:
         behind = se3.log(se3.compose(se3.inverse(T_base_sensor), se3.compose(self._start, se3.exp(before))))
         if np.linalg.norm(behind[:3]) < _BEHIND_M and np.linalg.norm(behind[3:]) < _BEHIND_RAD:
             self._t_s = min(self._t_s + dt_s, self._duration_s + _BACK_S)
-        twist: Array = (self._displacement(self._t_s) - before) / dt_s + _BACK_PER_S * behind
+        self._drag = np.clip(self._drag + dt_s * _BACK_PER_S2 * behind, -_MOST_DRAG, _MOST_DRAG)
+        twist: Array = (self._displacement(self._t_s) - before) / dt_s + _BACK_PER_S * behind + self._drag
         return twist
 
     def verdict(self) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from enum import Enum, auto
 from typing import Annotated, Final, TypeVar
 
@@ -13,8 +13,9 @@ from touchcell.drivers.core.commands import TwistCommand, TwistFrame
 from touchcell.drivers.core.protocols import SERVO_ARM
 from touchcell.errors import TouchcellError
 from touchcell.geometry.types import Array
-from touchcell.tasks.contact_servo import Behavior, ContactServo, ContactServoConfig, Sidestepping, Six
+from touchcell.tasks.contact_servo import Behavior, ContactServo, ContactServoConfig, NeedsFeature, Sidestepping, Six
 from touchcell.tasks.interface import SPEED, Action, Observation, TaskContext, TaskSpec, TransitionRecord
+from touchcell.tasks.planned_places import PlannedPlace
 from touchcell.tasks.sensor_check import SensorCheck
 from touchcell.tasks.state_machine import FAULT, STOP, TRIP, StateDef, Table, TaskMachine, TransitionDef, state_name
 from touchcell.tasks.state_machine_task import MachineTask
@@ -145,9 +146,11 @@ def servo_table(
             TransitionDef("contact", s.APPROACH, s.SETTLE),
             TransitionDef("no_contact", s.APPROACH, s.RETRACT),
             TransitionDef("agrees", s.CHECK, s.SETTLE),
+            TransitionDef("missed", s.CHECK, s.RETRACT),
             TransitionDef("lost", s.CHECK, s.APPROACH, guard="may_reapproach"),
             TransitionDef("lost", s.CHECK, s.RETRACT),
             TransitionDef("settled", s.SETTLE, s.RUN),
+            TransitionDef("missed", s.SETTLE, s.RETRACT),
             TransitionDef("lost", s.SETTLE, s.APPROACH, guard="may_reapproach"),
             TransitionDef("lost", s.SETTLE, s.RETRACT),
             TransitionDef("finished", s.RUN, s.RETRACT),
@@ -329,18 +332,24 @@ class ServoTask(MachineTask):
                     self._post("no_contact", f"none within {self._config.approach_distance_mm:g} mm")
             case ServoState.CHECK:
                 self._watch_contact(dt_s)
+                if astray := self._astray(dt_s):
+                    self._post("missed", astray)
                 self._watch_check()
             case ServoState.SETTLE:
                 self._watch_contact(dt_s)
                 steady = all(servo.only_touches or servo.steady() for servo in servos)
                 self._steady_s = self._steady_s + dt_s if steady else 0.0
-                if steady and self._steady_s >= self._config.settle_time_s:
+                if astray := self._astray(dt_s):
+                    self._post("missed", astray)
+                elif steady and self._steady_s >= self._config.settle_time_s:
                     self._post("settled")
             case ServoState.RUN:
                 self._watch_contact(dt_s)
                 # Every servo processes the cycle, even if another one has already finished.
                 finished = [servo.advance(dt_s) for servo in servos]
-                if any(finished):
+                if astray := self._astray(dt_s):
+                    self._post("missed", astray)
+                elif any(finished):
                     shortfalls = [servo.run.shortfall() for servo in servos]
                     if missed := next(filter(None, shortfalls), ""):
                         self._post("missed", missed)
@@ -359,6 +368,17 @@ class ServoTask(MachineTask):
             case ServoState.RETRACT:
                 if all(servo.travelled_m() >= 1e-3 * self._config.retract_mm for servo in servos):
                     self._post("retracted")
+
+    def _astray(self, dt_s: float) -> str:
+        """Return why a behavior cannot go on, by what its sensor touches; empty where all can."""
+        for servo in self._servos:
+            if (
+                servo.contact is not None
+                and isinstance(servo.run, NeedsFeature)
+                and (why := servo.run.astray(dt_s, servo.contact.touched))
+            ):
+                return f"{servo.sensor}: {why}"
+        return ""
 
     def _watch_check(self) -> None:
         """Record what the sensors measure, and judge it when all have moved."""
@@ -521,6 +541,7 @@ def one_arm_task(
     config: type[ServoConfigT],
     behavior: Callable[[ServoConfigT], Behavior],
     reference_mm_deg: Callable[[ServoConfigT], Six],
+    places: Callable[[ServoConfigT, Array | None, Array], Iterable[PlannedPlace]] | None = None,
 ) -> TaskSpec[ServoConfigT]:
     """Return the spec of a task in which ``arm`` holds a contact with ``sensor`` and runs one behavior.
 
@@ -530,10 +551,13 @@ def one_arm_task(
         config: pydantic model of its parameters.
         behavior: creates the behavior from the parameters.
         reference_mm_deg: returns the contact to hold, Euler components of ``T_f_s``.
+        places: of its ``TaskSpec``.
     """
 
     def build(config: ServoConfigT, context: TaskContext) -> ServoTask:
         servo = ContactServo(ARM, SENSOR, config, reference_mm_deg(config), behavior(config), context)
         return ServoTask(name, config, context, servo)
 
-    return TaskSpec(name, summary, config, {ARM: SERVO_ARM}, frozenset({SENSOR}), build)
+    return TaskSpec(
+        name, summary, config, {ARM: SERVO_ARM}, frozenset({SENSOR}), build, starts_free=True, places=places
+    )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
@@ -15,9 +15,10 @@ from touchcell.geometry.types import Array
 from touchcell.tasks.contact_servo import ContactServoConfig, Six, SixGains
 from touchcell.tasks.free_motion import Goal
 from touchcell.tasks.interface import SPEED
+from touchcell.tasks.planned_places import PlannedPlace
 from touchcell.tasks.predictive_push import PredictivePush, PredictivePushSettings, Progress, twist_in_sensor
 from touchcell.tasks.push_path import Obstacle, plan
-from touchcell.tasks.servoing import ServoConfig, one_arm_task
+from touchcell.tasks.servoing import ARM, ServoConfig, one_arm_task
 
 Mm = tuple[float, float]
 _SIGMAS = 2.0
@@ -104,6 +105,12 @@ class PushConfig(ContactServoConfig):
     arrival_tolerance_mm: PositiveFloat = 5.0
     arrival_tolerance_deg: PositiveFloat = 10.0
     max_cross_track_mm: PositiveFloat = 60.0
+
+    def planned_places(self, arm: str) -> Iterator[PlannedPlace]:
+        """Return where the tip of the pushing ``arm`` ends: behind the object's centre, which is at the target then."""
+        tip_m = 1e-3 * np.array([*self.target_mm, math.nan])
+        slack_m = 1e-3 * (self.object_center_offset_mm + self.arrival_tolerance_mm)
+        yield PlannedPlace(("target_mm",), arm, tip_m=tip_m, slack_m=slack_m)
 
     def alignment(self) -> TargetAlignment:
         """Return the steering controller, in SI units."""
@@ -333,4 +340,5 @@ SPEC = one_arm_task(
     SingleArmPushingConfig,
     Push,
     lambda config: config.reference_mm_deg,
+    lambda config, start, mount: config.planned_places(ARM),
 )

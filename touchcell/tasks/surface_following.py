@@ -6,7 +6,7 @@ Either in one direction of the sensor, as in the paper, or along a planned path 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Annotated
 
 import numpy as np
@@ -16,8 +16,14 @@ from touchcell.geometry.types import Array
 from touchcell.tasks.contact_servo import SixGains
 from touchcell.tasks.felt_curvature import CurvedWay
 from touchcell.tasks.interface import DEPTH, DISTANCE, SPEED
-from touchcell.tasks.servoing import ServoConfig, one_arm_task
+from touchcell.tasks.planned_places import PlannedPlace
+from touchcell.tasks.servoing import ARM, ServoConfig, one_arm_task
 from touchcell.tasks.surface_path import Guide, PathConfig
+
+_APPROACH_M = 0.02
+"""The first contact is hardly farther from the start than this."""
+_BEND = 0.5
+"""Share of a way by which its end may be elsewhere: on a plane tilted by 30 deg."""
 
 
 class SurfaceFollowingConfig(ServoConfig):
@@ -129,10 +135,21 @@ def _behavior(config: SurfaceFollowingConfig) -> Follow | FollowPath:
     return Follow(config) if config.path is None else FollowPath(config, config.path)
 
 
+def _places(config: SurfaceFollowingConfig, T_base_tcp: Array | None, T_tcp_sensor: Array) -> Iterator[PlannedPlace]:
+    """Return the corners of the path, near the plane of the first contact; a straight way may end anywhere."""
+    if config.path is None or T_base_tcp is None:
+        return
+    T_base_sensor = T_base_tcp @ T_tcp_sensor
+    for x, y in config.path.corners():
+        tip_m = T_base_sensor[:3, 3] + T_base_sensor[:3, :2] @ np.array([x, y])
+        yield PlannedPlace(("path",), ARM, tip_m=tip_m, slack_m=_APPROACH_M + _BEND * math.hypot(x, y))
+
+
 SPEC = one_arm_task(
     "surface_following",
     "slide over an unknown surface at constant depth and normal to it",
     SurfaceFollowingConfig,
     _behavior,
     lambda config: (0.0, 0.0, config.depth_mm, 0.0, 0.0, 0.0),
+    _places,
 )

@@ -92,7 +92,7 @@ class CellUnderTest:
             self.plan = file
         else:
             settings = {"on_trip": "wait_for_reset", **(set or {})}
-            self.plan = plan_in_world(find_cell(Path(file)), on, settings=settings)
+            self.plan = plan_in_world(find_cell(Path(file)), on, settings=settings, prove=False)
         if self.plan.cell.time != "simulated" and not isinstance(file, CellPlan):
             raise ConfigError(
                 "runs in real time, so a test cannot step it",
@@ -108,6 +108,7 @@ class CellUnderTest:
         self._channel = OperatorChannel()
         self._loop = RunLoop(self.cell, None, box=self, stop=self._stop, channel=self._channel)
         self._going = True
+        self._broken: list[str] = []
         for device in self._first_faults:
             self._device(device)
 
@@ -124,6 +125,9 @@ class CellUnderTest:
         try:
             self._loop.end()
         finally:
+            # A device that the test has broken cannot be seen at rest, and would not be given back.
+            for device in self._broken:
+                self.clear(device)
             self.cell.__exit__(kind, error, trace)
 
     def __repr__(self) -> str:
@@ -251,6 +255,7 @@ class CellUnderTest:
             ConfigError: no such device, it has no faults to inject, or no such fault.
         """
         found = self._device(device)
+        self._broken.append(device)
         if self._emulated is not None:
             self._emulated.inject(device, faults)
             return
@@ -275,7 +280,7 @@ class CellUnderTest:
     def provoke(self, interlock: str, settings: Mapping[str, Any] | None = None) -> Violation:
         """Show an interlock, alone, the first fault that must trip it, until it trips; return the first cause.
 
-        The other interlocks go on seeing the cell as it is, so that what trips is this one. It works in
+        The other interlocks still see the cell as it is, so that what trips is this one. It works in
         every world: a bench stops its real arms.
 
         Args:

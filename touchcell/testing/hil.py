@@ -160,7 +160,7 @@ def rig_in(
 
 
 def ask(config: pytest.Config, device: str, what: str = _SHORT_MOVES) -> None:
-    """Ask the operator before a device is powered; end the session where nobody agrees."""
+    """Ask the operator before a device is powered; end the session without consent."""
     capture = config.pluginmanager.getplugin("capturemanager")
     with capture.global_and_fixture_disabled():
         if sys.stdin is not None and sys.stdin.isatty():

@@ -25,13 +25,15 @@ def test_every_report_is_handled(row: zoo.ZooRow, tmp_path: Path) -> None:
 def test_every_report_is_of_a_driver_with_an_emulator_and_none_is_there_twice() -> None:
     rows = zoo.rows()
     assert {row.driver for row in rows} <= set(RIGS.names())
-    assert len({(row.source, row.failure) for row in rows}) == len(rows) >= 200
+    assert len({(row.source, row.failure) for row in rows}) == len(rows) >= 240
 
 
 def test_every_injection_is_a_fault_that_the_emulator_knows() -> None:
     from touchcell.drivers.damiao.emulator import DamiaoArm
     from touchcell.drivers.feetech.emulator import FeetechArm
     from touchcell.drivers.franka.emulator.server import FrankaEmulator
+    from touchcell.drivers.net_ft.emulator import NetFtBox
+    from touchcell.drivers.robotiq.emulator import RobotiqHand
     from touchcell.drivers.ur.emulator.server import UrEmulator
     from touchcell.drivers.v4l2.emulator.server import V4l2Emulator
 
@@ -39,6 +41,8 @@ def test_every_injection_is_a_fault_that_the_emulator_knows() -> None:
         "damiao_can": DamiaoArm,
         "feetech_serial": FeetechArm,
         "franka": FrankaEmulator,
+        "net_ft": NetFtBox,
+        "robotiq": RobotiqHand,
         "ur": UrEmulator,
         "v4l2": V4l2Emulator,
     }

@@ -43,6 +43,26 @@ def test_a_run_is_written_for_rerun_with_what_rerun_does_not_draw_itself(folder:
     assert target.stat().st_size > 10_000
 
 
+def test_reruns_viewer_need_not_be_in_path_and_its_failure_is_one_message(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rerun = pytest.importorskip("rerun", reason="pip install 'touchcell[rerun]'")
+    asked: list[str] = []
+
+    def spawn(*, executable_path: str, **_: object) -> None:
+        asked.append(executable_path)
+        raise RuntimeError("no display\nand much more")
+
+    monkeypatch.setenv("PATH", "")
+    monkeypatch.setattr(rerun, "spawn", spawn)
+    assert main(["open", str(folder), "--rerun"]) == 2
+    assert Path(asked[0]).is_file()
+    printed = capsys.readouterr().err
+    assert "does not start: no display" in printed
+    assert "much more" not in printed
+    assert "--foxglove" in printed
+
+
 def test_a_target_without_rerun_is_refused(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["open", str(folder), "--to", "x.rrd"]) == 2
     assert "--rerun" in capsys.readouterr().err

@@ -137,8 +137,8 @@ def test_a_slower_arm_needs_less_margin(tmp_path: Path) -> None:
 
 def test_the_length_of_the_sensor_swings_further(tmp_path: Path) -> None:
     long = ("mounted_on: arm", "mounted_on: arm\n    tcp_to_sensor_mm_deg: [0, 0, 100, 0, 0, 0]")
-    deep = ("min_mm: [-150, -50, 10]", "min_mm: [-150, -50, -90]")
-    plan = plan_cell(written(tmp_path, long, deep, ("margin_mm: 15", "margin_mm: 30")))
+    high = ("[-80, 0, 25,", "[-80, 0, 125,")
+    plan = plan_cell(written(tmp_path, long, high, ("margin_mm: 15", "margin_mm: 30")))
     way = plan.stopping_distances["workspace"]
     assert way.speed_m_s == pytest.approx(0.1 + 0.5 * 0.1)
     assert way.braking_m == pytest.approx(0.01 + 0.5 * 0.05 * 0.5 / 2.5)
@@ -256,3 +256,38 @@ def test_a_name_belongs_to_one_device(tmp_path: Path) -> None:
     path = written(tmp_path, ("interlocks:\n", "devices:\n  arm: {driver: replay_camera, data: .}\n\ninterlocks:\n"))
     error = refused(path)
     assert (error.key, error.reason) == ("devices.arm", "another device has this name")
+
+
+def six_joints() -> str:
+    """Return a URDF of an arm with six joints and a gripper's seventh."""
+    links = "".join(f'<link name="link{i}"/>' for i in range(8))
+    joints = "".join(
+        f'<joint name="joint{i}" type="revolute"><parent link="link{i}"/><child link="link{i + 1}"/>'
+        f'<origin xyz="0 0 0.1"/><axis xyz="{int(i % 2 == 0)} 0 {int(i % 2)}"/>'
+        '<limit lower="-2" upper="2" velocity="2" effort="20"/></joint>'
+        for i in range(7)
+    )
+    return f'<robot name="mine">{links}{joints}</robot>'
+
+
+@pytest.mark.parametrize(
+    ("chain", "says"),
+    [
+        ("arm.urdf#link6", ""),
+        ("arm.urdf", "has 7 joints"),
+        ("arm.urdf#link9", "has no link 'link9'"),
+        ("other.urdf#link6", "no such file"),
+    ],
+)
+def test_a_chain_is_found_in_a_urdf_beside_the_cell(chain: str, says: str, tmp_path: Path) -> None:
+    (tmp_path / "arm.urdf").write_text(six_joints())
+    cell = tmp_path / "cell.yaml"
+    cell.write_text((CONFIGS / "steps_damiao_bench.yaml").read_text().replace("chain: generic_6r", f"chain: {chain}"))
+    if says:
+        with pytest.raises((ConfigError, ExceptionGroup)) as caught:
+            plan_cell(cell)
+        assert says in str(caught.value) + repr(getattr(caught.value, "exceptions", ""))
+    else:
+        found = plan_cell(cell).arms["arm"].config.described_chain()
+        assert found is not None
+        assert found.joint_names[-1] == "joint5"

@@ -50,6 +50,18 @@ def test_virtual_buses_and_pseudo_terminals_lead_to_no_device_of_a_bench() -> No
     assert not is_virtual_can("slcan", "/dev/ttyACM0")
 
 
+def test_a_cell_that_feels_edges_gets_a_disc_and_the_network_of_simulated_edges(tmp_path: Path) -> None:
+    cell = tmp_path / "cell.yaml"
+    cell.write_text((CONFIGS / "edge_follow_bench.yaml").read_text().replace("builtin:sim_edge", "mine.safetensors"))
+    (tmp_path / "mine.safetensors").write_bytes(
+        (CONFIGS.parent / "perception/models/sim_edge.safetensors").read_bytes()
+    )
+    plan = plan_in_world(cell, "sim")
+    assert plan.cell.sensors["sensor"].estimator.model == "builtin:sim_edge"
+    assert plan.cell.scene["feels"] == "shape"
+    assert [each["kind"] for each in plan.cell.scene["surfaces"].values()] == ["cylinder"]
+
+
 @pytest.mark.parametrize("cell", CELLS)
 def test_every_shipped_bench_cell_can_be_simulated_with_its_drivers_own_abilities(cell: str) -> None:
     plan = plan_in_world(CONFIGS / cell, "sim")

@@ -159,3 +159,15 @@ def test_unknown_experiment_gets_a_suggestion(tmp_path, capsys):
 def test_an_unknown_executor_is_answered_with_a_suggestion(tmp_path):
     with pytest.raises(ConfigError, match="did you mean 'local'"):
         perform_all(Perform(duration, tmp_path), TWO, executor="locl")
+
+
+def test_the_html_report_is_one_file_with_a_point_for_each_trial(tmp_path):
+    pytest.importorskip("plotly", reason="pip install 'touchcell[html]'")
+    tiny = ExperimentSpec("tiny", "two ways", lambda scale: TWO, duration, (Column("run_s", "s"),), lambda *_: [])
+    result = run_experiment(tiny, tmp_path, Scale(), as_html=True)
+    page = (tmp_path / "report.html").read_text()
+    assert "report.html" in result.text
+    for each in result.finished:
+        assert page.count(each.trial.name) >= 3, "in a measure, among the paths, and in the table"
+    assert "src='http" not in page
+    assert 'src="http' not in page

@@ -127,7 +127,7 @@ def recorded(root: Path, name: str) -> list[object]:
     return [message for message in read(root / name / "run.mcap") if message.topic != "/timing"]
 
 
-@pytest.mark.parametrize(("executor", "module"), [("dask", "distributed"), ("slurm:local", "submitit")])
+@pytest.mark.parametrize(("executor", "module"), [("dask", "distributed"), ("ray", "ray"), ("slurm:local", "submitit")])
 def test_workers_that_share_no_files_give_the_same_recordings(executor, module, tmp_path, monkeypatch):
     pytest.importorskip(module)
     monkeypatch.chdir(tmp_path)

@@ -66,6 +66,14 @@ def test_a_run_without_images_is_replayed_from_its_estimates(recorded: Callable[
     assert "no images" in done.notes[0]
 
 
+def test_estimates_that_no_filter_carries_on_are_counted_once_each(
+    recorded: Callable[..., Path], tmp_path: Path
+) -> None:
+    edge = ("--set", "task.close_loop=false", *SHORT)
+    done = replay(recorded("edge_follow_sim.yaml", *edge), out(tmp_path))
+    assert [str(each) for each in differences(done, EXACT) if not each.agrees] == []
+
+
 def test_a_trip_is_found_again_in_the_same_cycle(recorded: Callable[..., Path], tmp_path: Path) -> None:
     folder = recorded("surface_follow_sim.yaml", *SHORT, "--set", "interlocks.indentation.limit_mm=3.1", exit_code=3)
     done = replay(folder, out(tmp_path))
@@ -101,6 +109,17 @@ def test_only_what_came_before_a_reset_is_replayed(tmp_path: Path) -> None:
     found = read_run(file)
     assert found.resumed
     assert [cycle.task_state for cycle in found.cycles] == ["run", "tripped"]
+
+
+@pytest.mark.parametrize(
+    ("topic", "form", "lossy"), [("image", "png", False), ("image", "jpeg", True), ("video", "h264", True)]
+)
+def test_images_that_the_recording_has_changed_are_known(topic: str, form: str, lossy: bool, tmp_path: Path) -> None:
+    file = tmp_path / RECORDING
+    with Recorder(file) as recorder:
+        recorder.write(f"/sensors/sensor/{topic}", 1, {"format": form})
+        recorder.write("/task", 2, {"state": "run"})
+    assert read_run(file).lossy is lossy
 
 
 def test_the_command_says_what_differs_and_draws_it(

@@ -141,7 +141,7 @@ def test_a_sender_that_goes_before_its_answer_harms_nothing(tmp_path: Path, chan
 def test_another_user_is_refused(
     tmp_path: Path, channel: OperatorChannel, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(operator_channel, "_peer_uid", lambda connection: 12345)
+    monkeypatch.setattr(operator_channel, "peer_uid", lambda connection: 12345)
     with connected(tmp_path) as client:
         client.send(json.dumps({"ask": "reset", "operator": "eve"}).encode())
         assert channel.take() is None

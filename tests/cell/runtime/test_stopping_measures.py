@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from touchcell.cell.runtime.stopping import STOP_MARGIN_S, Stopper, StopReport
 from touchcell.drivers.core.clock import VirtualClock
@@ -200,3 +202,95 @@ def test_a_stop_after_rest_is_measured_anew() -> None:
     clock.advance_s(1.0)
     machine.stop(tripped=True)
     assert watched(machine)["arm"].time_s == pytest.approx(0.0)
+
+
+LIMITS = Scripted.limits
+
+
+def told_late(
+    linear: float, angular: float, age_s: float, period_s: float, gain: float, reacts_s: float, brakes: float
+) -> tuple[StopReport, float]:
+    """An arm that is measured ``age_s`` before the stop, becomes faster until it, and then brakes.
+
+    ``gain`` and ``brakes`` are shares of the acceleration limits. Returns the report, and when it really stood.
+    """
+    clock = VirtualClock(10**12)
+    start_s = 1e-9 * clock.now_ns()
+    v = max(linear, min(linear + gain * LIMITS.accel_m_s2 * age_s, LIMITS.speed_m_s))
+    w = max(angular, min(angular + gain * LIMITS.rot_accel_rad_s2 * age_s, LIMITS.rot_speed_rad_s))
+    decel = brakes * LIMITS.accel_m_s2
+    rest_s = reacts_s + max(v / decel, w / (brakes * LIMITS.rot_accel_rad_s2))
+
+    def x_m(t_s: float) -> float:
+        since_s = t_s - start_s
+        braking_s = min(max(since_s - reacts_s, 0.0), v / decel)
+        # Where it is now; a state is always ``age_s`` old, which what is measured of the way does not gain from.
+        return v * min(max(since_s, 0.0), reacts_s) + v * braking_s - 0.5 * decel * braking_s**2
+
+    class Late(Scripted):
+        def tcp(self, max_age_s: float | None = None) -> Stamped[TcpState]:
+            state = super().tcp(max_age_s)
+            if not self.stops or len(self.read_ns) == 1:
+                # The farthest it can have come between its state and the stop.
+                state.value.T_base_tcp[0, 3] = -0.5 * (linear + v) * age_s
+            return state
+
+    arm = Late(clock, start_s + rest_s, x_m, (linear, 0, 0, 0, 0, angular), round(1e9 * age_s))
+    machine = Stopper({"arm": arm}, {"arm": HOLD}, clock, period_s)
+    machine.stop(tripped=True)
+    return watched(machine)["arm"], rest_s
+
+
+def test_positions_of_an_arm_that_stands_may_be_a_tenth_of_a_millimetre_apart() -> None:
+    for noise_m, kept in ((0.99e-4, True), (1.01e-4, False)):
+        clock = VirtualClock()
+        found = stopped(Scripted(clock, 0.015, lambda t_s, noise_m=noise_m: noise_m if t_s > 0.005 else 0.0), clock)
+        assert found.distance_m == noise_m
+        assert found.kept == kept
+
+
+@given(
+    linear=st.floats(0.0, LIMITS.speed_m_s),
+    angular=st.floats(0.0, LIMITS.rot_speed_rad_s),
+    period_s=st.sampled_from([0.001, 0.01, 0.05]),
+    age=st.floats(0.0, 2.0),
+    gain=st.floats(0.0, 1.0),
+    reacts=st.floats(0.0, 1.0),
+    brakes=st.floats(1.0, 3.0),
+)
+def test_a_stop_within_the_limits_is_kept_however_old_its_state_was(
+    linear: float, angular: float, period_s: float, age: float, gain: float, reacts: float, brakes: float
+) -> None:
+    # Rest is noticed in the first period after it.
+    reacts_s = reacts * (STOP_MARGIN_S - period_s - 1e-6)
+    found, rest_s = told_late(linear, angular, age * period_s, period_s, gain, reacts_s, brakes)
+    assert found.kept
+    assert not found.escalated
+    assert found.time_s is not None
+    assert found.time_s >= rest_s - 1e-6, "nothing is called a stop that is none yet"
+
+
+@given(
+    linear=st.floats(0.0, LIMITS.speed_m_s),
+    angular=st.floats(0.0, LIMITS.rot_speed_rad_s),
+    period_s=st.sampled_from([0.001, 0.01, 0.05]),
+    age=st.floats(0.0, 2.0),
+    brakes=st.floats(0.05, 1.0),
+    reacts_s=st.floats(0.0, 0.5),
+)
+def test_what_is_kept_took_no_longer_and_no_further_than_the_limits_and_the_age_of_its_state_allow(
+    linear: float, angular: float, period_s: float, age: float, brakes: float, reacts_s: float
+) -> None:
+    age_s = age * period_s
+    found, rest_s = told_late(linear, angular, age_s, period_s, 1.0, reacts_s, brakes)
+    slack_s = age_s + STOP_MARGIN_S
+    most_s = max(linear / LIMITS.accel_m_s2, angular / LIMITS.rot_accel_rad_s2) + slack_s
+    most_m = LIMITS.speed_m_s * (0.5 * (linear / LIMITS.accel_m_s2 + age_s) + slack_s)
+    if found.kept:
+        assert rest_s <= most_s + 1e-6
+        assert found.distance_m is not None
+        assert found.distance_m <= most_m + 1e-6
+    if rest_s > most_s + 1e-6:
+        assert not found.kept
+    if rest_s > most_s + period_s:
+        assert found.escalated

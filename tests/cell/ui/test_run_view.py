@@ -10,8 +10,11 @@ import pytest
 
 from touchcell.cell.cli.main import main
 from touchcell.cell.recording.mcap import RECORDING
+from touchcell.cell.recording.message_types import Encoder
+from touchcell.cell.recording.messages import declared_type
+from touchcell.cell.runtime.black_box import BlackBox
 from touchcell.cell.runtime.operator_input import reachable
-from touchcell.cell.ui.run_view import RunView
+from touchcell.cell.ui.run_view import RunView, sources
 from touchcell.cell.ui.runs import Runs
 from touchcell.cell.ui.stl import stl
 from touchcell.geometry.solids import Cuboid, triangulated
@@ -52,7 +55,12 @@ def test_every_interlock_has_a_bar_and_those_in_the_recording_a_fraction(view: R
     fractions = {bar.interlock: bar.fraction for bar in moment.bars}
     assert fractions["indentation"] == pytest.approx(3.0 / 5.0, abs=0.1)
     assert 0.0 < (fractions["tilt"] or 0.0) < 0.3
-    assert fractions["limited"] is None
+    # Timers and what is compared with earlier images come from the supervisor.
+    assert all(fraction is not None for fraction in fractions.values())
+    assert fractions["limited"] == 0.0
+    texts = {bar.interlock: bar.text for bar in moment.bars}
+    assert texts["frozen_frame"].endswith("of 200 ms")
+    assert texts["exposure"].endswith("%")
 
 
 def test_a_contact_has_six_components_with_deviations(view: RunView) -> None:
@@ -126,3 +134,38 @@ def test_stl_has_every_triangle() -> None:
     data = stl(mesh)
     assert len(data) == 84 + 50 * len(mesh.triangles)
     assert int.from_bytes(data[80:84], "little") == 12
+
+
+def test_a_black_box_is_shown_by_the_same_widgets(runs: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "runs" / "tripped"
+    changes = ("task.distance_mm=40", "interlocks.shear.limit_mm=1")
+    settings = [word for each in changes for word in ("--set", each)]
+    assert main(["run", "surface_follow_sim.yaml", "--quiet", "--out", str(folder), *settings]) == 3
+    assert sources(folder) == [RECORDING, "blackbox.mcap"]
+    assert Runs(folder.parent, folder).view("tripped", "../tripped/run.mcap") is None
+    whole, box = RunView(folder), RunView(folder, "blackbox.mcap")
+    whole.read()
+    box.read()
+    first, last = whole.moment(), box.moment()
+    assert first is not None
+    assert last is not None
+    assert last.state == first.state
+    assert last.contacts == first.contacts
+    np.testing.assert_allclose(last.poses["arms/arm/tcp"], first.poses["arms/arm/tcp"])
+    assert [bar.text for bar in last.bars] == [bar.text for bar in first.bars]
+
+
+def test_the_ring_of_a_run_that_was_killed_is_shown(runs: Path, tmp_path: Path) -> None:
+    (tmp_path / "cell.yaml").write_bytes((runs / "first" / "cell.yaml").read_bytes())
+    encoder = Encoder(declared_type)
+    with BlackBox(tmp_path, {}) as box:
+        for t_ns, state in ((0, "approach"), (10**9, "run")):
+            box.add("/task", t_ns, encoder.encode("/task", {"state": state}))
+    assert sources(tmp_path) == ["blackbox.ring"]
+    view = RunView(tmp_path, "blackbox.ring")
+    view.read()
+    assert view.problem == ""
+    early, late = view.moment(0.5), view.moment()
+    assert early is not None
+    assert late is not None
+    assert (early.state, late.state) == ("approach", "run")

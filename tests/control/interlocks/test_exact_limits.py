@@ -27,6 +27,7 @@ from touchcell.drivers.core.enabling import EnablingPosition
 from touchcell.drivers.core.gate import TwistLimits
 from touchcell.drivers.core.samples import Stamped, TcpState
 from touchcell.drivers.kinematics.adjustment import Adjustment
+from touchcell.errors import ConfigError
 from touchcell.geometry import se3
 
 CYCLE_NS = 10_000_000
@@ -362,6 +363,26 @@ def test_contact_force_is_a_force_and_no_torque_and_leaves_at_four_fifths() -> N
     assert run.arm(wrench=(0, 0, 0.79 * transient_n, 0, 0, 0)) is None
 
 
+@pytest.mark.parametrize(
+    "entry",
+    [
+        {"kind": "wrench", "arm": "arm", "limit_n": 5, "limit_nm": 1},
+        {"kind": "pressure", "arm": "arm", "regions": ["palm_other"], "contact_area_mm2": 100},
+    ],
+)
+def test_a_fault_of_a_force_is_a_wrench_of_six_numbers_after_none(entry: dict[str, Any]) -> None:
+    faults = list(parse_interlocks({"it": entry})["it"].faults(FACTS))  # type: ignore[attr-defined]
+    assert len(faults) > 1
+    for fault in faults:
+        healthy = FACTS.healthy(START_NS, "run")
+        before = fault.before(healthy, -0.1).arms["arm"].wrench
+        assert before is not None
+        assert before.value.shape == (6,)
+        assert not before.value.any()
+        pushed = fault.change(healthy, 0.0).arms["arm"].wrench
+        assert pushed is None or pushed.value.shape == (6,)
+
+
 # --- boxes and cones
 
 BOX = {"kind": "workspace", "arm": "arm", "min_mm": [-100, -100, 0], "max_mm": [100, 100, 300], "margin_mm": 10}
@@ -400,6 +421,42 @@ def test_on_either_side_it_counts_as_inside_a_fifth_of_the_margin_from_the_wall(
     assert reason(run.arm((side * 98.1, 0, 100, 0, 0, 0))) == text
     assert run.arm((side * 97.9, 0, 100, 0, 0, 0)) is None
     assert run.arm((side * 98.1, 0, 100, 0, 0, 0)) is None
+
+
+def test_at_its_wall_what_was_outside_is_not_yet_inside() -> None:
+    run = Run(**BOX)
+    assert run.arm((101, 0, 100, 0, 0, 0)) is not None
+    assert reason(run.arm((100, 0, 100, 0, 0, 0))) == "x = 100.0 mm is not yet 2 mm inside 100 mm"
+
+
+def test_a_box_without_an_inside_is_refused() -> None:
+    with pytest.raises(ConfigError):
+        Run(**{**BOX, "min_mm": [-100, 0, 0], "max_mm": [100, 0, 300]})
+
+
+@pytest.mark.parametrize("kind", ["workspace", "tilt"])
+def test_of_an_arm_that_is_not_there_the_others_are_named(kind: str) -> None:
+    entry: dict[str, Any] = {**(BOX if kind == "workspace" else CONE), "arm": "amr"}
+    settings = parse_interlocks({"it": entry})
+    (interlock,) = build_interlocks(settings, {})
+    (found,) = prove("it", settings["it"], interlock, CellFacts(0.01, ("run",), ARMS, {}))
+    assert found.problem == "the task has no arm 'amr'"
+    assert found.hint == "did you mean 'arm'?"
+
+
+@pytest.mark.parametrize("sensor", [None, "sensor"])
+def test_what_a_fault_of_a_boundary_puts_into_the_view_are_poses(sensor: str | None) -> None:
+    facts = FACTS if sensor is not None else CellFacts(0.01, ("run",), ARMS, {})
+    for entry in (BOX, {**CONE, "direction": [1, 2, -3]}):
+        settings = parse_interlocks({"it": {**entry, **({} if sensor is None else {"sensor": sensor})}})
+        (interlock,) = build_interlocks(settings, {"sensor": np.eye(4)})
+        assert getattr(interlock, "T_tcp_point", np.eye(4)).shape == (4, 4)
+        faults = list(settings["it"].faults(facts))  # type: ignore[attr-defined]
+        assert faults
+        for fault in faults:
+            T = fault.change(facts.healthy(START_NS, "run"), 0.0).arms["arm"].state.value.T_base_tcp
+            np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)
+            np.testing.assert_array_equal(T[3], [0, 0, 0, 1])
 
 
 def test_a_box_that_is_thin_is_entered_a_quarter_of_its_width_inside_its_walls() -> None:

@@ -12,17 +12,27 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from touchcell.control.interlocks.config import build_interlocks, parse_interlocks
+from touchcell.control.interlocks.coverage import ArmFacts, CannotTrip, CellFacts, SensorFacts
 from touchcell.control.interlocks.pair import Carried
 from touchcell.control.interlocks.planning_scene import PlanningScene
 from touchcell.control.interlocks.snapshot import ArmView, CellView, SensorView
 from touchcell.control.interlocks.timers import InterlockState, TimedInterlock
 from touchcell.control.interlocks.violation import Severity, Violation
+from touchcell.control.proof import Proof, prove
+from touchcell.drivers.core.gate import TwistLimits
 from touchcell.drivers.core.samples import Stamped, TcpState
 from touchcell.errors import ConfigError
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 
 DT_S = 0.01
+DEFAULTS: dict[str, dict[str, Any]] = {
+    "out_of_step": {"limit_mm_s": 5, "limit_mm": 2, "hold_ms": 50},
+    "object_lost": {"limit_ms": 100},
+    "toppling": {"limit_deg": 5, "limit_deg_s": 8, "limit_mm": 2, "hold_ms": 50},
+    "slip": {"limit_ratio": 1.0, "hold_ms": 50},
+    "markers_lost": {"limit_percent": 10, "frames": 3},
+}
 MOUNTS = {
     "leader_sensor": se3.from_euler_mm_deg(np.array([0, 0, 50.0, 0, 0, 0])),
     "follower_sensor": se3.from_euler_mm_deg(np.array([0, 0, 60.0, 0, 0, 30.0])),
@@ -75,14 +85,7 @@ class HeldBox:
 
 
 def rule(kind: str, **changes: Any) -> TimedInterlock:
-    defaults: dict[str, dict[str, Any]] = {
-        "out_of_step": {"limit_mm_s": 5, "limit_mm": 2, "hold_ms": 50},
-        "object_lost": {"limit_ms": 100},
-        "toppling": {"limit_deg": 5, "limit_deg_s": 8, "limit_mm": 2, "hold_ms": 50},
-        "slip": {"limit_ratio": 1.0, "hold_ms": 50},
-        "markers_lost": {"limit_percent": 10, "frames": 3},
-    }
-    entry = {"kind": kind, **defaults[kind], **changes}
+    entry = {"kind": kind, **DEFAULTS[kind], **changes}
     (built,) = build_interlocks(parse_interlocks({kind: entry}), MOUNTS, PlanningScene(BASES))
     assert isinstance(built, TimedInterlock)
     return built
@@ -426,3 +429,120 @@ def test_the_velocity_of_a_tip_is_that_of_its_point_on_the_tool(seed: int) -> No
     later[:3, 3] += twist[:3] * dt_s
     moved = carried.pose(view_of(later), sensor)[:3, 3] - carried.pose(view_of(T_base_tcp), sensor)[:3, 3]
     assert carried.velocity(view_of(T_base_tcp), sensor) == pytest.approx(moved / dt_s, abs=1e-5)
+
+
+def test_tips_at_one_place_neither_close_nor_part_and_a_depth_that_is_not_known_is_not_compared() -> None:
+    held = HeldBox()
+    view = held.view()
+    both = {role: view.arms[role.partition("_")[0]] for role in view.sensors}
+    at_one_place = {
+        arm: replace(both[f"{arm}_sensor"], state=Stamped(TcpState(T, np.full(6, 0.1)), view.now_ns, 1))
+        for arm, T in (
+            (arm, se3.inverse(BASES[arm]) @ se3.inverse(MOUNTS[f"{arm}_sensor"])) for arm in ("leader", "follower")
+        )
+    }
+    for depths in ((0.003, 0.003), (None, 0.003), (0.003, None)):
+        sensors = {
+            role: replace(view.sensors[role], depth_m=depth)
+            for role, depth in zip(("leader_sensor", "follower_sensor"), depths, strict=True)
+        }
+        for arms in (view.arms, at_one_place):
+            found, _ = held_by(limit_mm_s=1e6, limit_mm=1e-3).evaluate(replace(view, arms=arms, sensors=sensors), {})
+            assert found is None
+
+
+def test_a_contact_just_deep_enough_is_a_reference_for_leaning() -> None:
+    held = HeldBox()
+
+    def move(t_s: float) -> None:
+        held.offset_mm_deg = {arm: np.array([0, 0, 1.0, 0, 0, 0]) for arm in held.offset_mm_deg}
+        held.T_world_box = se3.from_euler_mm_deg(np.array([0, 0, 150.0, 0, 20.0 if t_s > 0.1 else 0.0, 0]))
+
+    assert any(watch(rule("toppling", hold_ms=0, limit_deg_s=1e6, limit_mm=50), held, 0.3, move))
+
+
+def test_leaning_counts_as_over_down_to_four_fifths() -> None:
+    held = HeldBox()
+    leans = iter([0.0, 5.1, 4.9, 4.1, 3.9, 4.9])
+
+    def move(t_s: float) -> None:
+        held.T_world_box = se3.from_euler_mm_deg(np.array([0, 0, 150.0, 0, next(leans), 0]))
+
+    found = [
+        each is not None for each in watch(rule("toppling", hold_ms=0, limit_deg_s=1e6, limit_mm=50), held, 0.06, move)
+    ]
+    assert found == [False, True, True, True, False, False]
+
+
+def test_an_arm_without_a_place_of_its_own_stands_at_the_origin() -> None:
+    settings = parse_interlocks({"it": {"kind": "toppling", **DEFAULTS["toppling"]}})
+    (built,) = build_interlocks(settings, MOUNTS, PlanningScene())
+    for carried in built.sensors:  # type: ignore[union-attr]
+        np.testing.assert_array_equal(carried.T_world_base, np.eye(4))
+
+
+# --- what armed coverage shows these rules
+
+LIMITS = TwistLimits(0.1, 0.5, 0.5, 2.5, 50.0, 250.0)
+FACTS = CellFacts(
+    DT_S,
+    ("push",),
+    {arm: ArmFacts(LIMITS, 1.0) for arm in BASES},
+    {role: SensorFacts("network", role.partition("_")[0], T, 7e-3, 6e-3, 0.1) for role, T in MOUNTS.items()},
+    PlanningScene(BASES),
+)
+
+
+def proofs(kind: str, **changes: Any) -> tuple[Proof, ...]:
+    settings = parse_interlocks({"it": {"kind": kind, **DEFAULTS[kind], **changes}})
+    (built,) = build_interlocks(settings, MOUNTS, PlanningScene(BASES))
+    return prove("it", settings["it"], built, FACTS)
+
+
+@pytest.mark.parametrize(
+    ("kind", "key", "proven", "refused"),
+    [
+        ("toppling", "limit_deg", 44.0, 45.0),
+        ("toppling", "limit_deg_s", 89.0, 90.0),
+        ("toppling", "limit_mm", 5.8, 6.1),
+        ("out_of_step", "limit_mm_s", 190.0, 205.0),
+        ("out_of_step", "limit_mm", 6.7, 7.1),
+        ("out_of_step", "hold_ms", 1900.0, 5000.0),
+        ("object_lost", "limit_ms", 1900.0, 5000.0),
+    ],
+)
+def test_the_largest_limit_that_is_proven(kind: str, key: str, proven: float, refused: float) -> None:
+    for value, armed in ((proven, True), (refused, False)):
+        found = proofs(kind, **{key: value})
+        assert all(each.problem == "" for each in found) == armed, (value, found)
+
+
+@pytest.mark.parametrize("kind", ["out_of_step", "object_lost"])
+def test_a_pair_of_one_sensor_is_none(kind: str) -> None:
+    found = proofs(kind, follower_sensor="leader_sensor", **({"follower": "leader"} if kind == "out_of_step" else {}))
+    assert [each.problem for each in found] == ["leader and follower are one sensor, 'leader_sensor'"]
+    assert not any(each.problem for each in proofs(kind))
+
+
+def test_toppling_takes_one_or_two_sensors_each_once() -> None:
+    (found,) = proofs("toppling", sensors=["leader_sensor", "leader_sensor"], arms=["leader", "leader"])
+    assert found.problem == "names one sensor twice"
+    assert not any(each.problem for each in proofs("toppling", sensors=["follower_sensor"], arms=["follower"]))
+    with pytest.raises(ConfigError):
+        proofs("toppling", sensors=["leader_sensor", "follower_sensor", "third"], arms=["leader", "follower", "x"])
+    with pytest.raises(ConfigError):
+        proofs("toppling", arms=["leader", "follower", "third"])
+
+
+@pytest.mark.parametrize("kind", ["out_of_step", "object_lost", "toppling"])
+def test_what_a_fault_puts_into_the_view_are_poses(kind: str) -> None:
+    settings = parse_interlocks({"it": {"kind": kind, **DEFAULTS[kind]}})["it"]
+    for fault in settings.faults(FACTS):  # type: ignore[attr-defined]
+        assert not isinstance(fault, CannotTrip)
+        for t_s in (0.0, 1.0):
+            view = fault.change(FACTS.healthy(10**9, "push"), t_s)
+            poses = [arm.state.value.T_base_tcp for arm in view.arms.values()]
+            poses += [each.T_s_f for each in view.sensors.values() if each.T_s_f is not None]
+            for T in poses:
+                np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)
+                np.testing.assert_array_equal(T[3], [0, 0, 0, 1])

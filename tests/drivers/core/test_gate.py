@@ -130,6 +130,78 @@ def test_after_a_silence_it_starts_from_rest() -> None:
     assert first == pytest.approx(20.0 * FIRST_STEP_S**2)
 
 
+def named(sent: Sent[TwistCommand]) -> set[str]:
+    return {adjustment.limit for adjustment in sent.adjustments}
+
+
+def test_each_part_of_a_ramp_names_the_limit_that_shapes_it_and_no_other() -> None:
+    harness = GateHarness()
+    harness.send(np.zeros(6))
+    ramp = [named(harness.send(np.array([0.05, 0, 0, 0, 0, 0]))) for _ in range(60)]
+    accelerating, jerking = {"tcp linear acceleration"}, {"tcp linear jerk"}
+    # The jerk limits the first and the last 0.5 / 20 s, and between them the acceleration is constant.
+    assert ramp[:6] == [accelerating | jerking] * 6
+    assert ramp[6:24] == [accelerating] * 18
+    assert ramp[24:28] == [accelerating | jerking] * 4
+    assert ramp[28:30] == [jerking] * 2
+    assert ramp[30:] == [set()] * 30
+
+
+def test_an_acceleration_ends_within_the_jerk_limit_even_where_the_wanted_twist_is_reached_already() -> None:
+    harness = GateHarness()
+    harness.send(np.zeros(6))
+    before, now = (harness.send(np.array([0.05, 0, 0, 0, 0, 0])).command.twist[0] for _ in range(13)), 0.0
+    *_, last, now = before
+    accel = (now - last) / DT_S
+    assert accel == pytest.approx(0.5)
+    sent = harness.send(np.array([now, 0, 0, 0, 0, 0]))
+    assert (sent.command.twist[0] - now) / DT_S == pytest.approx(accel - 20.0 * DT_S)
+    assert named(sent) == {"tcp linear jerk"}
+
+
+@pytest.mark.parametrize(("late_ns", "first"), [(0, False), (1, True)])
+def test_at_the_end_of_its_time_a_command_still_moves_the_arm_and_a_nanosecond_later_it_stands(
+    late_ns: int, first: bool
+) -> None:
+    harness = GateHarness()
+    forward = np.array([0.1, 0, 0, 0, 0, 0])
+    for _ in range(100):
+        harness.send(forward)
+    harness.clock.advance_s(0.1 + 1e-9 * late_ns)
+    command = TwistCommand(forward, TwistFrame.BASE, harness.clock.now_ns(), 0.1)
+    sent = harness.gate.admit(command, harness.lease, Lifecycle.ACTIVE, np.eye(4))
+    assert (sent.command.twist[0] < 0.01) == first
+
+
+def test_a_limit_is_named_above_it_and_not_at_it() -> None:
+    # Numbers that are exact in binary: from rest 0.5 m/s2 and 512 m/s3 for 2^-10 s, and 0.125 m/s.
+    at_most = TwistLimits(0.125, 0.5, 0.5, 2.5, 512.0, 1e12)
+    for speed, limits in ((2.0**-11, set()), (2.0**-10, {"tcp linear acceleration"})):
+        harness = GateHarness(at_most)
+        command = TwistCommand(np.array([speed, 0, 0, 0, 0, 0]), TwistFrame.BASE, 10**9, 2.0**-10)
+        assert named(harness.gate.admit(command, harness.lease, Lifecycle.ACTIVE, np.eye(4))) == limits
+    for linear, angular, limits in (
+        (0.125, 0.5, set()),
+        (0.126, 0.5, {"tcp linear speed"}),
+        (0.125, 0.51, {"tcp angular speed"}),
+    ):
+        harness = GateHarness(at_most)
+        for _ in range(100):
+            sent = harness.send(np.array([linear, 0, 0, angular, 0, 0]))
+        assert named(sent) == limits
+
+
+@pytest.mark.parametrize("part", [0, 3])
+def test_limits_of_zero_let_nothing_move_and_take_a_command_to_stand(part: int) -> None:
+    speeds = {"speed_m_s": 0.0} if part == 0 else {"rot_speed_rad_s": 0.0}
+    for limits in (TwistLimits(0.0, 0.0, 0.0, 0.0, 0.0, 0.0), replace(LIMITS, **speeds)):
+        for twist in (np.zeros(6), np.eye(6)[part], 10.0 * np.eye(6)[3 - part] + 0.0):
+            harness = GateHarness(limits)
+            for _ in range(5):
+                sent = harness.send(twist)
+            assert not sent.command.twist[part : part + 3].any()
+
+
 def free_harness(**changes: float) -> GateHarness:
     return GateHarness(FREE, DifferentialIk(CHAIN, replace(IkSettings(), **changes)))
 

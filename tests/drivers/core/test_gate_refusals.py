@@ -33,8 +33,8 @@ FORWARD = np.array([0.1, 0, 0, 0, 0, 0])
 class GateHarness:
     """A gate with its lease, and the command that would pass."""
 
-    def __init__(self, limits: TwistLimits = LIMITS, max_ttl_s: float = 0.5) -> None:
-        self.clock = VirtualClock(10**9)
+    def __init__(self, limits: TwistLimits = LIMITS, max_ttl_s: float = 0.5, start_ns: int = 10**9) -> None:
+        self.clock = VirtualClock(start_ns)
         self.desk = LeaseManager("arm")
         self.gate = TwistGate("arm", limits, self.desk, self.clock, max_ttl_s=max_ttl_s)
         self.lease: Any = self.desk.acquire("test")
@@ -345,14 +345,18 @@ def test_a_twist_changed_by_a_driver_is_checked_again(made: Array, reason: Rejec
 
 
 class Overshooting(DifferentialIk):
-    """Kinematics that return a larger twist than the requested one."""
+    """Kinematics that return a larger twist than the requested one, from the second time on."""
+
+    def __init__(self, scale: float) -> None:
+        super().__init__(SerialChain(ChainDescription.shipped("generic_6r")))
+        self.scales = [1.0, scale]
 
     def at(self, q: Array) -> Any:
-        local = super().at(q)
+        local, scales = super().at(q), self.scales
 
         class Local:
             def limited(self, twist: Array) -> Any:
-                return local.limited(twist)[0], 1e3, ()
+                return local.limited(twist)[0], scales.pop(0), ()
 
             def acceleration_scale(self, step: Array, dt_s: float) -> Any:
                 return 1.0, ()
@@ -360,15 +364,39 @@ class Overshooting(DifferentialIk):
         return Local()
 
 
-def test_kinematics_that_return_too_much_are_caught_before_it_is_sent() -> None:
+@pytest.mark.parametrize(
+    ("scale", "reason", "limit"),
+    [
+        (1e3, Rejection.LIMIT, (0.1, 0.5)),
+        # The gate takes one part in a million for rounding.
+        (1.0 + 1.5e-6, Rejection.LIMIT, (0.1, 0.5)),
+        (1.0 + 0.5e-6, None, None),
+        (math.nan, Rejection.NON_FINITE, None),
+        (math.inf, Rejection.NON_FINITE, None),
+    ],
+)
+@pytest.mark.parametrize("twist", [FORWARD, np.array([0, 0, 0, 0.5, 0, 0])])
+def test_kinematics_that_return_too_much_are_caught_before_it_is_sent(
+    twist: Array, scale: float, reason: Rejection | None, limit: Any
+) -> None:
     harness = GateHarness(NO_JERK)
-    ik = Overshooting(SerialChain(ChainDescription.shipped("generic_6r")))
-    harness.cruise()
-    command = TwistCommand(FORWARD, TwistFrame.BASE, harness.clock.now_ns(), 0.1)
-    with pytest.raises(CommandRejected) as caught:
-        harness.gate.admit(command, harness.lease, Lifecycle.ACTIVE, np.eye(4), joints=lambda: ik.at(np.full(6, 0.5)))
-    assert caught.value.reason is Rejection.LIMIT
-    assert caught.value.limit == (0.1, 0.5)
+    ik = Overshooting(scale)
+    harness.cruise(twist)
+
+    def joints() -> Any:
+        return ik.at(np.full(6, 0.5))
+
+    def admit() -> Sent[TwistCommand]:
+        with np.errstate(invalid="ignore"):
+            return harness.gate.admit(command, harness.lease, Lifecycle.ACTIVE, np.eye(4), joints=joints)
+
+    command = TwistCommand(twist, TwistFrame.BASE, harness.clock.now_ns(), 0.1)
+    if reason is None:
+        np.testing.assert_allclose(admit().command.twist, twist, rtol=1e-6)
+        return
+    with pytest.raises(CommandRejected) as refused:
+        admit()
+    assert (refused.value.reason, refused.value.limit) == (reason, limit)
 
 
 @pytest.mark.parametrize("field", ["speed_m_s", "rot_speed_rad_s"])
@@ -403,6 +431,8 @@ def test_a_time_to_live_too_short_to_divide_by_is_limited_as_a_microsecond(harne
     for _ in range(3):
         sent = harness.send(ttl_s=ttl_s)
         assert 0.0 < np.linalg.norm(sent.command.twist) <= 0.5e-6
+    first = GateHarness(NO_JERK).send(ttl_s=ttl_s)
+    assert np.linalg.norm(first.command.twist) == pytest.approx(0.5e-6)
 
 
 def test_a_reset_makes_the_next_command_the_first(harness: GateHarness) -> None:
@@ -446,5 +476,7 @@ def test_a_checked_array_is_a_copy_unless_nothing_can_change_it() -> None:
 
 def test_the_first_command_from_rest_accelerates_for_a_millisecond_at_most() -> None:
     """The shortest control cycle: 0.5 m/s2 for 1 ms."""
-    speed = float(np.linalg.norm(GateHarness(NO_JERK).send(ttl_s=0.5).command.twist))
-    assert speed == pytest.approx(0.5e-3)
+    harness = GateHarness(NO_JERK)
+    assert np.linalg.norm(harness.send(ttl_s=0.5).command.twist) == pytest.approx(0.5e-3)
+    at_zero = GateHarness(NO_JERK, start_ns=0)
+    assert np.linalg.norm(at_zero.send(ttl_s=0.5, after_s=0.0).command.twist) == pytest.approx(0.5e-3)

@@ -9,7 +9,8 @@ from touchcell.cell.config.schema import plan_cell
 from touchcell.cell.config.yaml_file import InvalidCell
 from touchcell.errors import ConfigError
 from touchcell.simulation.meshes import primitives
-from touchcell.simulation.meshes.load import load_mesh, what_is_open
+from touchcell.simulation.meshes.load import load_mesh, volume_m3, what_is_open
+from touchcell.simulation.meshes.mesh_shape import MeshShape
 from touchcell.simulation.meshes.smoothing import TriangleMesh
 
 trimesh = pytest.importorskip("trimesh")
@@ -167,3 +168,63 @@ def test_check_names_hollows_into_which_the_tip_does_not_fit(tmp_path: Path) -> 
     assert "of its creases are hollow" in notes["creased"]
     assert "down to a radius of" in notes["narrow"]
     assert not notes["wide"]
+
+
+def as_drawing_programs_do(path: Path, mesh: TriangleMesh, *, sides: int) -> Path:
+    """Write an OBJ as collections of models for drawing have them: groups, materials, a normal for each face."""
+    lines = ["mtllib not_there.mtl", *(f"v {x:.7f} {y:.7f} {z:.7f}" for x, y, z in mesh.vertices.tolist())]
+    faces = mesh.faces.tolist()
+    normals = mesh.face_normals()
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    lines += [f"vn {x:.5f} {y:.5f} {z:.5f}" for x, y, z in normals.tolist()]
+    for i, face in enumerate(faces):
+        if i % 100 == 0:
+            lines += [f"g piece{i}", f"usemtl colour{i}"]
+        lines += ["f " + " ".join(f"{v + 1}//{i + 1}" for v in way) for way in (face, face[::-1])[:sides]]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+SHADE = primitives.height_field(np.zeros((5, 7)), 10e-3)
+LID = TriangleMesh(SHADE.vertices, SHADE.faces[SHADE.face_normals()[:, 2] > 0.0])
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_a_sheet_whose_faces_are_there_for_both_sides_can_be_touched_from_both(tmp_path: Path, side: float) -> None:
+    path = as_drawing_programs_do(tmp_path / "sheet.obj", LID, sides=2)
+    with pytest.raises(ConfigError, match="does not enclose a volume"):
+        load_mesh(path, "m", repair=False)
+    mesh = load_mesh(path, "m", repair=True)
+    assert what_is_open(mesh) == ""
+    height = float(LID.vertices[:, 2].max())
+    found = MeshShape(mesh, 0.5).nearest(np.array([3e-3, 4e-3, height + side * 17e-3]))
+    assert found.distance_m == pytest.approx(17e-3, abs=0.11e-3)
+    assert found.normal == pytest.approx([0.0, 0.0, side], abs=1e-6)
+
+
+def test_a_sheet_of_one_side_keeps_the_side_that_most_of_its_faces_have(tmp_path: Path) -> None:
+    faces = LID.faces.copy()
+    faces[:3] = faces[:3, ::-1]
+    mesh = load_mesh(
+        as_drawing_programs_do(tmp_path / "s.obj", TriangleMesh(LID.vertices, faces), sides=1), "m", repair=True
+    )
+    assert (mesh.face_normals()[:, 2] > 0.0).all()
+
+
+def test_an_obj_of_quads_with_normals_is_the_mesh_of_its_triangles(tmp_path: Path) -> None:
+    corners = primitives.box(np.array([0.06, 0.05, 0.04])).vertices
+    corners = np.unique(corners.round(9), axis=0)
+    quads = [(1, 2, 4, 3), (5, 7, 8, 6), (1, 5, 6, 2), (3, 4, 8, 7), (1, 3, 7, 5), (2, 6, 8, 4)]
+    lines = [f"v {x} {y} {z}" for x, y, z in corners.tolist()] + ["vn 0 0 1"]
+    lines += ["f " + " ".join(f"{v}//1" for v in quad) for quad in quads]
+    (tmp_path / "box.obj").write_text("\n".join(lines) + "\n")
+    mesh = load_mesh(tmp_path / "box.obj", "m", repair=False)
+    assert len(mesh.faces) == 12
+    assert volume_m3(mesh) == pytest.approx(0.06 * 0.05 * 0.04)
+
+
+def test_an_ascii_stl_in_inches_is_as_large_as_the_binary_one_in_millimetres(tmp_path: Path) -> None:
+    made = trimesh.Trimesh(BALL.vertices / 25.4e-3, BALL.faces, process=False)
+    (tmp_path / "ball.stl").write_text(trimesh.exchange.stl.export_stl_ascii(made))
+    mesh = load_mesh(tmp_path / "ball.stl", "inch", repair=False)
+    assert np.ptp(mesh.vertices, axis=0).max() == pytest.approx(0.08, abs=1e-5)

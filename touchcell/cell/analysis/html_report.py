@@ -2,26 +2,23 @@
 
 from __future__ import annotations
 
-import html
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
 from touchcell.cell.analysis.frame_poses import frame_poses
+from touchcell.cell.analysis.html_page import plotly_graphs, write_page
 from touchcell.cell.analysis.limits import WatchedQuantity, watched_quantities
 from touchcell.cell.analysis.run_data import STAGES, Run
 from touchcell.cell.analysis.run_folder import RunFolder
 from touchcell.cell.config.cell_plan import CellPlan
-from touchcell.cell.errors import RecordingError
 from touchcell.cell.recording.messages import COMPONENTS
 from touchcell.cell.scene.description import SceneDescription, describe_scene
 from touchcell.cell.scene.frames import WORLD
-from touchcell.errors import ConfigError
 from touchcell.geometry.solids import Polyline, triangulated
 from touchcell.geometry.types import Array
 
-REPORT: Final = "report.html"
 _PICTURES: Final = 40
 _MOST_POINTS: Final = 2000
 
@@ -33,13 +30,7 @@ def write_html(folder: Path) -> Path:
         ConfigError: plotly is missing, or the run's cell file cannot be read.
         RecordingError: the folder holds no recording, or it cannot be written.
     """
-    try:
-        import plotly.graph_objects as go
-        from plotly.offline import get_plotlyjs
-    except ModuleNotFoundError:
-        raise ConfigError(
-            "needs plotly, which is not installed", key="--html", hint="pip install 'touchcell[html]'"
-        ) from None
+    go = plotly_graphs()
     source = RunFolder(folder)
     run, plan = source.recording, source.plan
     figures: list[tuple[str, Any]] = [("The cell", _scene_figure(go, source, describe_scene(plan)))]
@@ -52,23 +43,7 @@ def write_html(folder: Path) -> Path:
         figures.append(("Duration of a cycle's stages", timing))
     summary = folder / "summary.txt"
     text = summary.read_text() if summary.exists() else ""
-    parts = [
-        f"<h2>{html.escape(title)}</h2>" + figure.to_html(full_html=False, include_plotlyjs=False)
-        for title, figure in figures
-    ]
-    page = (
-        f"<!doctype html><html lang=en><meta charset=utf-8><title>{html.escape(plan.cell.name)}</title>"
-        f"<style>body{{font-family:sans-serif;max-width:1200px;margin:2em auto;padding:0 1em}}"
-        f"pre{{background:#f4f4f4;padding:1em;overflow-x:auto}}</style>"
-        f"<script>{get_plotlyjs()}</script><h1>{html.escape(plan.cell.name)}</h1>"
-        f"<pre>{html.escape(text)}</pre>{''.join(parts)}</html>"
-    )
-    target = folder / REPORT
-    try:
-        target.write_text(page)
-    except OSError as error:
-        raise RecordingError(target, f"cannot be written: {error.strerror}") from None
-    return target
+    return write_page(folder, plan.cell.name, text, figures)
 
 
 def _scene_figure(go: Any, source: RunFolder, scene: SceneDescription) -> Any:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
+import rerun_cli
 
 from touchcell.cell.analysis.run_folder import RunFolder
 from touchcell.cell.recording.mcap import RECORDING, read
@@ -26,6 +27,7 @@ def show_in_rerun(folder: Path, target: Path | None = None) -> None:
 
     Raises:
         ConfigError: the cell file of the run cannot be read.
+        RuntimeError: the viewer does not start.
     """
     run = RunFolder(folder)
     scene = describe_scene(run.plan)
@@ -34,7 +36,11 @@ def show_in_rerun(folder: Path, target: Path | None = None) -> None:
     plots = [f"/arms/{role}" for role in run.plan.arm_roles]
     blueprint = _blueprint(images, plots)
     if target is None:
-        recording.spawn(default_blueprint=blueprint)
+        # Not searched for in PATH: an environment need not be activated.
+        viewer = Path(rerun_cli.__file__).with_name("rerun")
+        rr.spawn(
+            executable_path=str(viewer) if viewer.exists() else None, default_blueprint=blueprint, recording=recording
+        )
     else:
         recording.save(target, default_blueprint=blueprint)
     recording.log_file_from_path(folder / RECORDING)

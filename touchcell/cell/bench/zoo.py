@@ -88,7 +88,7 @@ def rows() -> list[ZooRow]:
 
 
 def try_row(row: ZooRow, fixture: DeviceFixture) -> tuple[str, str]:
-    """Inject one report; return the reaction, in the words of ``ZooRow.expect`` or "not noticed", and its message."""
+    """Inject one report; return the reaction, as ``ZooRow.expect`` has it or "not noticed", and its message."""
     emulated = _started(fixture)
     device: Device | None = None
     try:

@@ -185,7 +185,7 @@ class PeerProcess:
         return f"does not start within {_START_S:g} s"
 
     def trouble_within(self, seconds: float) -> str | None:
-        """Return the error that ends it within ``seconds``, or None if it goes on."""
+        """Return the error that ends it within ``seconds``, or None if it continues."""
         try:
             self._process.wait(seconds)
         except subprocess.TimeoutExpired:

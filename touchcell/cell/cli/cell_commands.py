@@ -41,6 +41,14 @@ def add_parser(commands: Subparsers) -> None:
         help="largest rate, in deg/s (default: %(default)g)",
     )
     jog.add_argument("--out", type=Path, metavar="FOLDER", help="run folder (default: runs/NAME-TIME)")
+    jog.add_argument(
+        "--input",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="also by gamepad or spacemouse, or by a page that `touchcell ui` serves; may be repeated",
+    )
+    jog.add_argument("--ui", action="store_true", help="also from the operator's page, which is served meanwhile")
     _add_live(jog)
 
     check = add_command(commands, "check", _check, "validate a cell file without connecting anything")
@@ -79,6 +87,8 @@ def _jog(options: argparse.Namespace) -> int:
         turn_deg_s=options.turn,
         out=options.out,
         live_port=options.live_port if options.live else None,
+        inputs=options.input,
+        page_port=0 if options.ui else None,
     )
 
 

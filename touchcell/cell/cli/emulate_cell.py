@@ -210,8 +210,10 @@ class CellEmulator(Emulator):
         return lambda: arm.T_world_tcp() @ T_tcp_s
 
     def _picture(self, name: str, number: int) -> ImageArray:
-        assert self._scene is not None
-        pixels = self._tip.pixels(self._scene.contact(name).value.T_f_s)
+        scene = self._scene
+        assert scene is not None
+        relief = scene.relief(name, self._tip.relief.directions) if scene.feels_shape else None
+        pixels = self._tip.pixels(scene.contact(name).value.T_f_s, relief)
         return self._renderers[name].raw(pixels, number)
 
 

@@ -83,7 +83,10 @@ def _add_training(commands: Subparsers) -> None:
     train_sim.add_argument("--tip", metavar="TIP", help="tip file of `calibrate-sim`, or the name of one that ships")
     train_sim.add_argument("--processed", action="store_true", help="for images as the public data have them")
     train_sim.add_argument(
-        "--feature", choices=("surface", "edge"), default="surface", help="what is touched (default: %(default)s)"
+        "--feature",
+        choices=("surface", "edge", "kinds"),
+        default="surface",
+        help="what is touched; kinds: a classifier that tells nothing, surface, edge and corner (default: %(default)s)",
     )
     train_sim.add_argument(
         "--feels",
@@ -196,6 +199,11 @@ def _train_many(options: argparse.Namespace, settings: dict[str, object]) -> int
 
 
 def _train_sim(options: argparse.Namespace) -> int:
+    if options.feature == "kinds":
+        from touchcell.cell.trainings.feature_kinds import train_kinds
+
+        print(train_kinds(options.out, samples=options.samples, epochs=options.epochs, seed=options.seed))
+        return EXIT_OK
     from touchcell.cell.cli.train_sim import train_on_simulation
 
     train_on_simulation(

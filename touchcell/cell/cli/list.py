@@ -10,12 +10,14 @@ from touchcell.cell.bench.catalog import benchmark_names
 from touchcell.cell.experiments.executors import EXECUTORS
 from touchcell.cell.experiments.runner import EXPERIMENTS
 from touchcell.control.interlocks.spec import INTERLOCKS
+from touchcell.drivers.core.jog import HAND_DEVICES
 from touchcell.drivers.core.spec import DRIVERS
 from touchcell.errors import ConfigError
 from touchcell.paths import CONFIGS
 from touchcell.perception.models.architecture_spec import ARCHITECTURES
 from touchcell.perception.networks.trainer import TRAINERS
 from touchcell.perception.runtime.estimator_spec import ESTIMATORS
+from touchcell.perception.runtime.feature_spec import FEATURES
 from touchcell.perception.runtime.filter_spec import FILTERS
 from touchcell.registry import Registry
 from touchcell.simulation.shape_spec import OBJECTS, SURFACES
@@ -27,6 +29,7 @@ def listing() -> dict[str, list[tuple[str, str]]]:
     """Title -> rows of (name, one line). A third party's broken plug-in is shown as such instead of hiding the rest."""
     return {
         "drivers": _rows(DRIVERS),
+        "input devices": _rows(HAND_DEVICES),
         "tasks": _rows(TASKS),
         "interlocks": [
             ("finite", "every number is finite; always on, checked first"),
@@ -37,6 +40,7 @@ def listing() -> dict[str, list[tuple[str, str]]]:
         "architectures": _rows(ARCHITECTURES),
         "trainers": _rows(TRAINERS),
         "filters": _rows(FILTERS),
+        "features": _rows(FEATURES),
         "surfaces": _rows(SURFACES),
         "objects": _rows(OBJECTS),
         "emulators": [(name, "") for name in EMULATORS.names()],

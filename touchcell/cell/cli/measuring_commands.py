@@ -42,6 +42,7 @@ def add_parser(commands: Subparsers) -> None:
     add_workers(experiment)
     _add_keep_stale(experiment)
     experiment.add_argument("--trials", type=positive, help="repetitions of each row (default: the experiment's own)")
+    experiment.add_argument("--html", action="store_true", help="also write report.html: one file, plots interactive")
     experiment.add_argument("--quick", action="store_true", help="the least that still shows every kind of row")
 
     sweep = add_command(commands, "sweep", _sweep, "run a cell with many settings: tables, plots and worst cases")
@@ -102,6 +103,7 @@ def _experiment(options: argparse.Namespace) -> int:
                 executor=options.executor,
                 keep_stale=options.keep_stale,
                 live=True,
+                as_html=options.html,
             )
         except KeyboardInterrupt:
             print(f"touchcell: what has finished is kept in {folder}; the same command goes on", file=sys.stderr)

@@ -23,7 +23,7 @@ def new_cell(name: str, source: str | None, folder: Path) -> list[Path]:
         folder: where to write it.
 
     Raises:
-        ConfigError: there is no such source, a file is there already or cannot be written.
+        ConfigError: there is no such source, a file exists already or cannot be written.
     """
     source = source or DEFAULT
     original = find_cell(Path(source))

@@ -41,7 +41,7 @@ def new_hil(cell: Path, folder: Path) -> Path:
         folder: where to write it.
 
     Raises:
-        ConfigError: the cell is not valid, cannot be simulated, or the module is there already.
+        ConfigError: the cell is not valid, cannot be simulated, or the module exists already.
     """
     plan = plan_in_world(cell, "sim", settings={"on_trip": "wait_for_reset"})
     module = folder / f"test_{re.sub(r'[^0-9a-z]+', '_', cell.stem.lower())}_hil.py"

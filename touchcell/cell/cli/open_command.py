@@ -1,4 +1,4 @@
-"""``touchcell open``: a run in somebody's favourite viewer."""
+"""``touchcell open``: a run in a viewer of one's choice."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def open_in_rerun(folder: Path, target: Path | None) -> None:
     """Open a run in Rerun, or write it for Rerun to ``target``.
 
     Raises:
-        ConfigError: rerun-sdk is missing.
+        ConfigError: rerun-sdk is missing, or its viewer does not start.
         RecordingError: the folder holds no run.
     """
     try:
@@ -56,6 +56,12 @@ def open_in_rerun(folder: Path, target: Path | None) -> None:
             key="--rerun",
             hint="pip install 'touchcell[rerun]', or --foxglove",
         ) from None
-    show_in_rerun(folder, target)
+    try:
+        show_in_rerun(folder, target)
+    except RuntimeError as error:
+        reason = str(error).partition("\n")[0]
+        raise ConfigError(
+            f"Rerun's viewer does not start: {reason}", key="--rerun", hint="--to FILE.rrd, or --foxglove"
+        ) from None
     if target is not None:
         say(f"written: {target} (`rerun {target}` shows it)")

@@ -24,7 +24,7 @@ def recover_cell(path: Path, ask: Callable[[str], str] = input, tell: Callable[[
     Args:
         path: the cell file.
         ask: puts a question to the operator and returns the answer.
-        tell: shows a line.
+        tell: prints a line.
 
     Returns:
         whether no device has a fault any more.

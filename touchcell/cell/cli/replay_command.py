@@ -12,6 +12,8 @@ from touchcell.progress import shown_progress
 
 PLOT = "replay.png"
 """Name of the plot in the folder of a replay."""
+_TWIST = 5.0
+_TWIST_OF_LOSSY = 10.0
 
 
 def add_parser(commands: Subparsers) -> None:
@@ -25,12 +27,20 @@ def add_parser(commands: Subparsers) -> None:
     add_run_folder(parser)
     add_set(parser)
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder of the replay (default: runs/NAME-replay-TIME)")
-    for name, unit, default, what in (
-        ("--tolerance", "MM", 0.5, "contact poses, mm and degrees"),
-        ("--tolerance-twist", "MM_S", 5.0, "twists, mm/s and deg/s"),
-    ):
-        help_text = f"largest difference of {what} (default: %(default)s)"
-        parser.add_argument(name, type=float, default=default, metavar=unit, help=help_text)
+    parser.add_argument(
+        "--tolerance",
+        type=float,
+        default=0.5,
+        metavar="MM",
+        help="largest difference of contact poses, mm and degrees (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--tolerance-twist",
+        type=float,
+        metavar="MM_S",
+        help=f"largest difference of twists, mm/s and deg/s (default: {_TWIST:g}; {_TWIST_OF_LOSSY:g} for images that "
+        "were recorded as video or JPEG)",
+    )
 
 
 def _replay(options: argparse.Namespace) -> int:
@@ -50,7 +60,10 @@ def _replay(options: argparse.Namespace) -> int:
                 settings=parse_settings(options.settings),
                 on_cycle=partial(show, "cycles"),
             )
-        found = differences(done, Tolerance(options.tolerance, options.tolerance_twist))
+        twist = options.tolerance_twist
+        if twist is None:
+            twist = _TWIST_OF_LOSSY if done.recorded.lossy else _TWIST
+        found = differences(done, Tolerance(options.tolerance, twist))
         plot = plot_replay(done, found, out / PLOT)
     for note in done.notes:
         print(f"note: {note}")

@@ -141,7 +141,7 @@ class RunOperator(Protocol):
         ...
 
     def attend(
-        self, cell: Cell, stop: StopRequest, channel: OperatorChannel, live: bool
+        self, cell: Cell, folder: Path, stop: StopRequest, channel: OperatorChannel, live: bool
     ) -> AbstractContextManager[Callable[[Progress], None]]:
         """Read the operator's input within the context; gives what is called after each cycle."""
         ...
@@ -175,7 +175,7 @@ def run_plan(
     with run_directory(plan.cell.name, out) as folder, _log_and_result(folder, plan) as result_file:
         logger.info("%s: task %s of %s, in %s", plan.cell.name, plan.task.name, plan.file, folder)
         try:
-            with _page(folder, page_port):
+            with _page(folder, page_port, moves=operator.jog_input is not None):
                 result, leaving = _run(cell, folder, live, result_file, live_port, operator)
         except Exception as error:
             _write_result(result_file, _not_started_json(plan, error))
@@ -185,13 +185,13 @@ def run_plan(
     return FinishedRun(result, folder, _report(folder), leaving)
 
 
-def _page(folder: Path, port: int | None) -> AbstractContextManager[None]:
+def _page(folder: Path, port: int | None, *, moves: bool) -> AbstractContextManager[None]:
     """The operator's page, from a process of its own."""
     if port is None:
         return contextlib.nullcontext()
     from touchcell.cell.ui.beside import page_beside
 
-    return page_beside(folder.absolute(), port)
+    return page_beside(folder.absolute(), port, moves=moves)
 
 
 @contextlib.contextmanager
@@ -260,7 +260,7 @@ def _running(
         _served(recorder, cell, live_port),
         cell,
         stop_on_signals(stop),
-        operator.attend(cell, stop, channel, live) as attend,
+        operator.attend(cell, folder, stop, channel, live) as attend,
     ):
         cell.watchdog.note_to(folder)
         if live:
@@ -303,7 +303,7 @@ class KeysAndLine:
 
     @contextlib.contextmanager
     def attend(
-        self, cell: Cell, stop: StopRequest, channel: OperatorChannel, live: bool
+        self, cell: Cell, folder: Path, stop: StopRequest, channel: OperatorChannel, live: bool
     ) -> Iterator[Callable[[Progress], None]]:
         """Read the keys within the context; yields what is called after each cycle."""
         with stop_on_keys(stop, channel=channel) as look_at_keys, _live_line(cell.plan, live) as show:

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias
 
 import numpy as np
 
@@ -28,7 +28,7 @@ from touchcell.perception.networks.training import Settings, train_on_arrays
 from touchcell.perception.runtime.estimator_spec import Feature
 from touchcell.simulation.edge_samples import edge_contacts
 from touchcell.simulation.render import FrameRenderer
-from touchcell.simulation.samples import SampledContact, Variation, contacts
+from touchcell.simulation.samples import USUAL_VARIATION, SampledContact, Variation, contacts
 from touchcell.simulation.shape_samples import shape_contacts
 from touchcell.simulation.tip import Tip, TipParameters
 from touchcell.simulation.tip_file import TipFile, load_tip
@@ -59,9 +59,6 @@ ARCHITECTURE = Architecture(
 # From the first touch to beyond the depth at which objects are tracked, so that neither is outside the training range.
 DEPTH_MM = (0.0, 6.5)
 
-VARIATION = Variation(parameters=0.01, turn_rad=0.002, shift_px=0.3, marker_px=0.1, disc_radius=0.03, missing=0.002)
-
-
 FITTED_VARIATION = Variation(
     parameters=0.002,
     turn_rad=0.0005,
@@ -73,6 +70,17 @@ FITTED_VARIATION = Variation(
     slip=0.15,
 )
 """About a real sensor, known better than the kind; ``field`` and ``slip`` are what its simulation cannot say."""
+
+EDGE_SETTINGS: Final[dict[str, Any]] = {
+    "batch_size": 128,
+    "learning_rate": 1.5e-3,
+    "noise": 0.01,
+    "shift_px": 0.1,
+    "turn_rad": 0.0005,
+    "zoom": 0.0003,
+    "details": 120,
+}
+"""How far an edge is off is told by tenths of a pixel (docs/decisions/0051-edges-in-detail.md)."""
 
 PUBLIC_SIZE = (PUBLIC_CROP[3] - PUBLIC_CROP[1], PUBLIC_CROP[2] - PUBLIC_CROP[0])
 PUBLIC_MASK_PX = 216.0
@@ -116,11 +124,11 @@ class Imagined:
     def contacts(self, samples: int, seed: int) -> Iterator[SampledContact]:
         """Random ones."""
         if self.feature == "edge":
-            return edge_contacts(samples, seed, variation=VARIATION)
+            return edge_contacts(samples, seed, variation=USUAL_VARIATION)
         if self.feels == "shape":
-            return shape_contacts(samples, seed, depth_mm=DEPTH_MM, variation=VARIATION)
+            return shape_contacts(samples, seed, depth_mm=DEPTH_MM, variation=USUAL_VARIATION)
         if self.sensor is None:
-            return contacts(samples, seed, depth_mm=DEPTH_MM, variation=VARIATION)
+            return contacts(samples, seed, depth_mm=DEPTH_MM, variation=USUAL_VARIATION)
         sensor = self.sensor
         return contacts(
             samples, seed, depth_mm=DEPTH_MM, parameters=sensor.tip, rig=sensor.rig, variation=FITTED_VARIATION
@@ -182,8 +190,10 @@ def _train_markers(
 
     settings = MarkerSettings(seed=seed)
     if imagined.of_shapes:
-        # One network in a file of 4 MB, which can ship.
+        # One network in a file of 4 MB, which can ship. Its sensors scatter already, by what a camera is remounted.
         settings = replace(settings, hidden=(384, 384, 256), networks=1)
+    if imagined.feature == "edge":
+        settings = replace(settings, **EDGE_SETTINGS)
     train_on_discs(
         _discs(imagined, samples, seed),
         _discs(imagined, samples // 5, seed + 1_000_000),

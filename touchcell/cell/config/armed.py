@@ -105,7 +105,7 @@ def cell_facts(plan: CellPlan, scene: PlanningScene | None = None) -> CellFacts:
 
 
 def built_task(plan: CellPlan) -> Task:
-    """Return the task of a planned cell, for what it can tell of itself: nothing runs."""
+    """Return the task of a planned cell, for what it declares of itself: nothing runs."""
     role_of = arm_roles(plan)
     sections = {role: plan.cell.sensors[name] for role, name in plan.sensor_roles.items()}
     carriers = {role: role_of[each.mounted_on] for role, each in sections.items() if each.mounted_on is not None}

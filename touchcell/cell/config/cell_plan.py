@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Self
 
 import yaml
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PositiveFloat, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, NonNegativeInt, PositiveFloat, model_validator
 
 from touchcell.cell.config.layers import load_layers
 from touchcell.cell.config.stopping_distance import StoppingDistance
@@ -239,7 +239,7 @@ class CellFile(_Section):
         time: ``simulated`` runs as fast as it can on a virtual clock, ``real`` in real time.
         rate_hz: control cycles per second.
         processes: ``separate`` runs devices in processes of their own with a watchdog, in real time only.
-        seed: of everything random.
+        seed: of everything random, from 0 on.
         max_duration_s: longest run; it is stopped then.
         scene: what is simulated around the arms, for simulated devices.
         emulated_scene: what ``touchcell emulate cell`` puts around the cell's arms and cameras; nothing else reads it.
@@ -257,7 +257,7 @@ class CellFile(_Section):
         task: what the cell does.
         recording: what is recorded of a run besides numbers.
         collect: where a task that labels frames puts them.
-        truth: what the simulated world truly is, where that differs from what this file tells the controllers.
+        truth: what the simulated world truly is, where that differs from what this file declares to the controllers.
         sweep: what ``touchcell sweep`` changes from trial to trial; nothing else reads it.
     """
 
@@ -268,7 +268,7 @@ class CellFile(_Section):
     time: Literal["simulated", "real"]
     rate_hz: Annotated[float, Field(gt=0, le=1000)]
     processes: Literal["one", "separate"] = "one"
-    seed: int = 0
+    seed: NonNegativeInt = 0
     max_duration_s: PositiveFloat = 3600.0
     scene: dict[str, Any] | None = None
     emulated_scene: dict[str, Any] | None = None

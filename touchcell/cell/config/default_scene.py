@@ -28,6 +28,9 @@ _PRISM_G: Final = 479
 _LONGEST_PUSH_M: Final = 0.120
 _INSIDE_M: Final = 0.015
 """No start is nearer than this to the wall of its box."""
+_DISC_M: Final = (0.050, 0.020)
+"""Radius and height of a disc with an edge to follow."""
+_FROM_THE_RIM_M: Final = 0.002
 _TURNS: Final = 12
 
 
@@ -94,6 +97,8 @@ def default_scene(plan: CellPlan, starts: Mapping[str, Sequence[float]]) -> dict
     tips = {role: _tip(plan, role, starts) for role in plan.sensor_roles}
     if "target_mm" in type(plan.task_config).model_fields:
         return _table_with_prism(tips)
+    if any(_section(plan, role).estimator.kind in _OF_EDGES for role in tips):
+        return _discs(tips)
     surfaces = {}
     moves = plan.task.name == "object_tracking" or not plan.arms
     for role, T_world_s in tips.items():
@@ -111,6 +116,23 @@ def default_scene(plan: CellPlan, starts: Mapping[str, Sequence[float]]) -> dict
             }
         surfaces[f"{role}_plate"] = plate
     return {"step_ms": 5, "surfaces": surfaces}
+
+
+_OF_EDGES: Final = frozenset({"edge_network", "true_edge"})
+"""Estimators of the edge under a tip."""
+
+
+def _discs(tips: Mapping[str, Array]) -> dict[str, Any]:
+    """Return a disc in front of each tip, which is over its face, a little inside the rim; x leads out over the rim."""
+    radius_m, height_m = _DISC_M
+    T_s_disc = np.diag([1.0, -1.0, -1.0, 1.0])
+    T_s_disc[:3, 3] = [_FROM_THE_RIM_M - radius_m, 0.0, _TIP_M + _GAP_M + height_m]
+    disc = {"kind": "cylinder", "radius_mm": 1e3 * radius_m, "height_mm": 1e3 * height_m}
+    surfaces = {
+        f"{role}_disc": {**disc, "pose_mm_deg": _rounded(_six(T_world_s @ T_s_disc))}
+        for role, T_world_s in tips.items()
+    }
+    return {"step_ms": 5, "feels": "shape", "surfaces": surfaces}
 
 
 _PLATE: Final = np.array([[1.0, 0, 0, 0], [0, -1.0, 0, 0], [0, 0, -1.0, _TIP_M], [0, 0, 0, 1.0]])

@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+import numpy as np
 from pydantic import BaseModel
 
 from touchcell.cell.config.yaml_file import KeyPath, YamlFile
@@ -17,7 +18,9 @@ from touchcell.drivers.core.scene import scene_section
 from touchcell.errors import ConfigError, suggest
 from touchcell.geometry import se3
 from touchcell.geometry.errors import GeometryError
+from touchcell.geometry.types import Array
 from touchcell.input_file import BUILTIN
+from touchcell.perception.runtime.filter_spec import FILTERS, FilterConfig
 from touchcell.tasks.interface import Demand
 
 if TYPE_CHECKING:
@@ -25,6 +28,9 @@ if TYPE_CHECKING:
 
 # Numbers that are equal but for rounding are no contradiction.
 _SLACK: Final = 1.0 + 1e-9
+_OF_EDGES: Final = ("sim_edge",)
+"""Shipped networks of edges."""
+_EXACTNESS_MM: Final = 1e-3
 _LONGEST_HEADER: Final = 100 << 20
 
 
@@ -32,13 +38,15 @@ def unfeasible(file: YamlFile, plan: CellPlan) -> list[ConfigError]:
     """Return one problem for everything that ``plan`` would be refused for, or would surely trip or fail on."""
     return [
         *_models(file, plan),
-        *_scene(file, plan),
+        *(scene := list(_scene(file, plan))),
         *_features(file, plan),
         *_interlock_sensors(file, plan),
         *_depths(file, plan),
         *_speeds(file, plan),
         *_distances(file, plan),
-        *_starts(file, plan),
+        *(starts := list(_starts(file, plan))),
+        *(() if starts else _places(file, plan)),
+        *(() if starts or scene else _contacts(file, plan)),
     ]
 
 
@@ -87,6 +95,15 @@ def _scene(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
 def _features(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
     for name in plan.sensor_roles.values():
         estimator, wanted = plan.cell.sensors[name].estimator, plan.task.feature
+        model = str(getattr(estimator, "model", ""))
+        of = "edge" if model.removeprefix(BUILTIN) in _OF_EDGES else "surface"
+        if model.startswith(BUILTIN) and of != estimator.feature:
+            yield file.problem(
+                ("sensors", name, "estimator", "model"),
+                f"estimates the pose of {_a(of)}, and {estimator.kind} needs one that does of {_a(estimator.feature)}",
+                value=model,
+                hint=f"{BUILTIN}{_OF_EDGES[0]}" if estimator.feature == "edge" else f"{BUILTIN}sim_gdn",
+            )
         if wanted is not None and estimator.feature != wanted:
             reason = f"{estimator.kind} estimates the pose of {_a(estimator.feature)}, and {plan.task.name} needs it of"
             yield file.problem(
@@ -94,6 +111,15 @@ def _features(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
                 f"{reason} {_a(wanted)}",
                 value=estimator.kind,
                 hint="kind: true_edge in a simulated scene" if wanted == "edge" else "kind: network",
+            )
+        section = getattr(estimator, "filter", None)
+        predicted = FILTERS.load(section.model).feature if isinstance(section, FilterConfig) else estimator.feature
+        if predicted != estimator.feature:
+            yield file.problem(
+                ("sensors", name, "estimator", "filter"),
+                f"it predicts the motion of {_a(predicted)}, and {estimator.kind} estimates {_a(estimator.feature)}",
+                value=section,
+                hint="leave out `filter:`",
             )
 
 
@@ -194,6 +220,78 @@ def _starts(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
                 value=start,
                 hint="start inside, or make the workspace larger",
             )
+
+
+def _places(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
+    """Places to which the task surely takes an arm, outside a box that it must not leave."""
+    if plan.task.places is None or not plan.sensor_roles:
+        return
+    sensor = plan.cell.sensors[plan.sensor_roles[min(plan.sensor_roles)]]
+    start = _start(plan, sensor.mounted_on) if sensor.mounted_on is not None else None
+    boxes: dict[str, Any] = {rule: box for rule, box in plan.cell.interlocks.items() if _is_kind(box, "workspace")}
+    reported = set()
+    for place in plan.task.places(plan.task_config, start, sensor.T_tcp_sensor):
+        for rule, box in boxes.items():
+            if place.key in reported or box.arm != place.arm:
+                continue
+            carried = plan.sensor_roles.get(box.sensor or "")
+            mount = np.eye(4) if carried is None else plan.cell.sensors[carried].T_tcp_sensor
+            point_mm, slack_mm = 1e3 * place.point_m(mount), 1e3 * place.slack_m + _EXACTNESS_MM
+            outside = [
+                f"{axis} = {value:.4g} mm, limit {low if value < low else high:g} mm"
+                for axis, value, low, high in zip("xyz", point_mm, box.min_mm, box.max_mm, strict=True)
+                if value < low - slack_mm or value > high + slack_mm
+            ]
+            if outside:
+                reported.add(place.key)
+                yield file.problem(
+                    ("task", *place.key),
+                    f"leads out of interlocks.{rule}, which would trip: {'; '.join(outside)}",
+                    hint="go less far, or make the workspace larger",
+                )
+
+
+def _contacts(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
+    """Tips pressed into the scene at the start of a task whose first frame has no contact; and no edge."""
+    if plan.cell.scene is None or not plan.task.starts_free or plan.cell.truth is not None:
+        return
+    tips, arms = {}, {}
+    for name in plan.sensor_roles.values():
+        sensor = plan.cell.sensors[name]
+        if sensor.mounted_on is not None and (start := _start(plan, sensor.mounted_on)) is not None:
+            base = _pose(plan.cell.arms[sensor.mounted_on].base_pose_mm_deg)
+            if base is not None:
+                arms[name], tips[name] = sensor.mounted_on, base @ start @ sensor.T_tcp_sensor
+    scene = scene_section().model_validate(plan.cell.scene)
+    try:
+        pressed = scene.pressed(tips)
+    except (ConfigError, GeometryError) as error:
+        key = error.key if isinstance(error, ConfigError) else ""
+        yield file.problem(("scene", *key.split(".")), str(error), hint="put it right")
+        return
+    if plan.task.feature == "edge" and not scene.has_edges():
+        hint = "e.g. {disc: {kind: cylinder, radius_mm: 50, height_mm: 20}}"
+        yield file.problem(("scene", "surfaces"), f"no surface has an edge, which {plan.task.name} needs", hint=hint)
+    for name, depth_m in pressed.items():
+        yield file.problem(
+            ("arms", arms[name], "start_pose_mm_deg"),
+            f"the tip of {name!r} is {1e3 * depth_m:.1f} mm deep in something there, but the task starts free",
+            hint="start farther away",
+        )
+
+
+def _start(plan: CellPlan, arm: str) -> Array | None:
+    """Pose (4, 4) of an arm's tool in its base frame at the start, if the cell knows it."""
+    pose = getattr(plan.arms[arm].config, "start_pose_mm_deg", None)
+    return None if pose is None else _pose(pose)
+
+
+def _pose(pose_mm_deg: Any) -> Array | None:
+    """Pose (4, 4) of six numbers; None if they are none."""
+    try:
+        return se3.from_euler_mm_deg(pose_mm_deg)
+    except GeometryError:
+        return None
 
 
 def _limits(plan: CellPlan, kind: str, key: str) -> Mapping[str, float]:

@@ -9,6 +9,11 @@ from touchcell.paths import CONFIGS
 
 
 def find_cell(path: Path) -> Path:
-    """``path`` itself, or the cell file of that name that ships with touchcell."""
-    shipped = CONFIGS / path.name
-    return path if os.path.exists(path) or not os.path.exists(shipped) else shipped
+    """Return ``path`` itself, or the cell file of that name that ships with touchcell.
+
+    The ending ``.yaml`` may be left out.
+    """
+    if os.path.exists(path) and not os.path.isdir(path):
+        return path
+    named = path if path.suffix else Path(f"{path}.yaml")
+    return next((file for file in (named, CONFIGS / named.name) if os.path.exists(file)), path)

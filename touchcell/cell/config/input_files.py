@@ -72,6 +72,9 @@ def _reference(info: FieldInfo) -> InputFile | None:
 
 def _found(file: YamlFile, reference: InputFile, name: str, at: KeyPath, problems: list[ConfigError]) -> str:
     """Return the path of ``name``, as found from the file that names it; ``name`` itself where it ships or is wrong."""
+    if reference.has_parts and "#" in name:
+        whole, mark, part = name.partition("#")
+        return _found(file, reference, whole, at, problems) + mark + part
     shipped = reference.shipped()
     is_path = Path(name).suffix in reference.suffixes or not reference.suffixes
     if reference.prefix and name.startswith(reference.prefix):

@@ -14,6 +14,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
+import numpy as np
 from pydantic import BaseModel
 
 from touchcell.cell.config.cell_plan import (
@@ -41,6 +42,8 @@ from touchcell.drivers.core.scene import scene_section
 from touchcell.drivers.core.spec import DRIVERS, AnyDriver, DriverConfig
 from touchcell.drivers.core.stand_in import STAND_INS, Placement
 from touchcell.errors import ConfigError, suggest
+from touchcell.geometry import se3
+from touchcell.geometry.types import Array
 from touchcell.input_file import BUILTIN
 from touchcell.tasks.interface import TASKS, AnyTask, TaskConfig
 
@@ -59,6 +62,7 @@ def plan_cell(
     settings: Mapping[str, Any] | None = None,
     world: WorldChanges | None = None,
     to_run: bool = True,
+    prove: bool = True,
 ) -> CellPlan:
     """Read and check a cell file without connecting anything.
 
@@ -67,6 +71,7 @@ def plan_cell(
         overrides: driver keys set from the command line (``--data``), for every device whose driver has such a key.
         model: network model in place of the one that the file names.
         to_run: False for the cell of a run that has been: its files may be gone, and its limits are not judged again.
+        prove: False leaves the proof that every interlock can trip to the activation of the composed cell.
         settings: values in place of the file's own, by dotted key ("task.speed_mm_s", "arms.arm.limits").
         world: what the world that it runs in changes; see ``plan_in_world``.
 
@@ -85,7 +90,7 @@ def plan_cell(
             estimator = sensor.get("estimator") if isinstance(sensor, dict) else None
             if isinstance(estimator, dict) and estimator.get("kind") in ("network", "edge_network"):
                 estimator["model"] = model
-    plan = _Planner(file, overrides, settings or {}, to_run=to_run).plan()
+    plan = _Planner(file, overrides, settings or {}, to_run=to_run, prove=prove).plan()
     return plan if world is None else replace(plan, world_settings=world.settings, notes=(*plan.notes, *world.notes))
 
 
@@ -97,27 +102,28 @@ def plan_in_world(
     model: str | None = None,
     settings: Mapping[str, Any] | None = None,
     more: Mapping[str, Any] | None = None,
+    prove: bool = True,
 ) -> CellPlan:
     """Read and check a cell file for one of its worlds; ``plan_cell`` has the other arguments.
 
     Args:
         path: the YAML file.
         world: where it is to run; None as the file is written.
-        overrides, model, settings: see ``plan_cell``; all go before what the world changes.
+        overrides, model, settings, prove: see ``plan_cell``; all go before what the world changes.
         more: further values that the world puts in place of the file's own, as the addresses of emulators.
 
     Raises:
         ConfigError: see ``plan_cell``; a device that the world has not.
     """
     if world is None:
-        return plan_cell(path, overrides, model=model, settings=settings)
+        return plan_cell(path, overrides, model=model, settings=settings, prove=prove)
     found = _as_written(path, overrides, model, settings)
     if found.cell.world is not None and world != "bench":
         # The file has been through this already, as that of a run folder has.
-        return plan_cell(path, overrides, model=model, settings={**(settings or {}), "world": world})
+        return plan_cell(path, overrides, model=model, settings={**(settings or {}), "world": world}, prove=prove)
     changes = world_changes(found, world)
     changes.settings.update(more or {})
-    return plan_cell(path, overrides, model=model, settings=settings, world=changes)
+    return plan_cell(path, overrides, model=model, settings=settings, world=changes, prove=prove)
 
 
 def _as_written(
@@ -131,10 +137,10 @@ def _as_written(
 
 class _Planner:
     def __init__(
-        self, file: YamlFile, overrides: Mapping[str, Any], settings: Mapping[str, Any], *, to_run: bool
+        self, file: YamlFile, overrides: Mapping[str, Any], settings: Mapping[str, Any], *, to_run: bool, prove: bool
     ) -> None:
         self._file = file
-        self._to_run = to_run
+        self._to_run, self._prove = to_run, prove
         self._overrides = overrides
         self._settings = settings
         self._problems: list[ConfigError] = []
@@ -205,7 +211,7 @@ class _Planner:
             return planned
         if problems := unfeasible(file, planned):
             raise InvalidCell(problems)
-        return replace(self._require_armed(planned), notes=_remarks(planned))
+        return replace(self._require_armed(planned) if self._prove else planned, notes=_remarks(planned))
 
     def _in_truth(self, cell: CellFile) -> CellFile:
         """Return the cell with its scene as it truly is, and keep what is true of its devices."""
@@ -224,7 +230,7 @@ class _Planner:
         return cell.model_copy(update={"scene": self._truth.scene(cell.scene)})
 
     def _with_truth(self, at: tuple[str, str], spec: AnyDriver, given: Mapping[str, Any]) -> dict[str, Any]:
-        """Return a device's keys with those that are true in place of those that are told."""
+        """Return a device's keys with the true ones in place of the declared ones."""
         true = self._truth.device(*at, given) if at[0] in ("arms", "sensors") else {}
         for key in true.keys() - spec.config.model_fields.keys():
             self._add(("truth", *at, key), f"{spec.name} has no {key!r}", hint="leave it out")
@@ -412,6 +418,7 @@ class _Planner:
     def _require_armed(self, plan: CellPlan) -> CellPlan:
         """An interlock that cannot trip, and what moves or feels and nothing guards, is refused."""
         from touchcell.cell.config.armed import cell_facts, not_armed, prove_cell
+        from touchcell.cell.config.healthy_start import trips_when_healthy
 
         try:
             facts = cell_facts(plan)
@@ -419,7 +426,8 @@ class _Planner:
         except ConfigError as error:
             self._add(tuple(error.key.split(".")), error.reason, value=error.value, hint=error.hint)
             raise InvalidCell(self._problems) from None
-        for problem in not_armed(plan, facts, proofs):
+        # What cannot trip is shown nothing that must not trip it.
+        for problem in list(not_armed(plan, facts, proofs)) or trips_when_healthy(plan, facts):
             self._add(problem.path, problem.reason, hint=problem.hint)
         if self._problems:
             raise InvalidCell(self._problems)
@@ -614,7 +622,23 @@ class _Planner:
 
 def _remarks(plan: CellPlan) -> tuple[str, ...]:
     scene = plan.cell.scene
-    return () if scene is None else tuple(scene_section().model_validate(scene).remarks())
+    if scene is None:
+        return ()
+    reach_mm = getattr(plan.task_config, "approach_distance_mm", None)
+    reach_m = None if reach_mm is None else 1e-3 * reach_mm
+    return tuple(scene_section().model_validate(scene).remarks(_sensor_starts(plan), reach_m))
+
+
+def _sensor_starts(plan: CellPlan) -> dict[str, Array]:
+    """Return the pose (4, 4) in the world of each of the task's sensors, where its arm has a start pose."""
+    starts = {}
+    for name in plan.sensor_roles.values():
+        section = plan.cell.sensors[name]
+        arm = plan.cell.arms.get(section.mounted_on or "")
+        if arm is not None and arm.start_pose_mm_deg is not None:
+            T_base_tcp = se3.from_euler_mm_deg(np.array(arm.start_pose_mm_deg))
+            starts[name] = arm.T_world_base @ T_base_tcp @ section.T_tcp_sensor
+    return starts
 
 
 def _a(word: str) -> str:

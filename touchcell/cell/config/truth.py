@@ -1,4 +1,4 @@
-"""The ``truth:`` section: what a simulated world truly is, apart from what tasks and controllers are told.
+"""The ``truth:`` section: what a simulated world truly is, apart from what tasks and controllers assume.
 
 Each value is a number or a distribution, which is sampled by the cell's seed: every key has a random stream of its own,
 so that adding one leaves the others as they are. What was sampled replaces keys of the scene and of simulated drivers;
@@ -87,7 +87,7 @@ _NONE: Final = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 class ArmTruth(_Section):
-    """How an arm differs from what is told of it. All but ``base_offset_mm_deg`` are keys of ``sim_arm``.
+    """How an arm differs from what the cell declares. All but ``base_offset_mm_deg`` are keys of ``sim_arm``.
 
     Attributes:
         base_offset_mm_deg: true pose of the base in the frame in which it is told to stand.
@@ -105,10 +105,10 @@ class ArmTruth(_Section):
 
 
 class SensorTruth(_Section):
-    """How a tactile sensor differs from what is told of it. All but ``mount_offset_mm_deg`` are keys of ``sim_tactip``.
+    """How a sensor differs from what the cell declares. All but ``mount_offset_mm_deg`` are keys of ``sim_tactip``.
 
     Attributes:
-        mount_offset_mm_deg: true pose of the sensor in the frame in which it is told to sit.
+        mount_offset_mm_deg: true pose of the sensor in the frame in which the cell declares it.
         tip: tip file, or the name of one that ships.
         rate_hz: frames per second.
         latency_ms: time from exposure to delivery.
@@ -181,7 +181,7 @@ class TableTruth(_Section):
 
 
 class TruthSection(_Section):
-    """What a simulated world truly is, where that differs from what the cell is told. Each value is a number, or
+    """What a simulated world truly is, where that differs from what the cell declares. Each value is a number, or
     a distribution that the cell's seed samples: ``{uniform: [low, high]}``, ``{normal: [mean, deviation]}`` (cut off
     at three deviations) or ``{choice: [...]}``.
 
@@ -248,7 +248,7 @@ class SampledTruth:
 
 
 def sample(truth: TruthSection, seed: int) -> SampledTruth:
-    """Return what ``seed`` makes of ``truth``: the same for the same key and seed, whatever else is there."""
+    """Return what ``seed`` makes of ``truth``: the same for the same key and seed, whatever other keys exist."""
     return SampledTruth(dict(_sampled(truth, "", seed)))
 
 

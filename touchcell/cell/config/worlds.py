@@ -19,7 +19,7 @@ from touchcell.input_file import BUILTIN
 
 WorldName: TypeAlias = Literal["sim", "emulated", "bench"]
 WORLDS: Final[tuple[WorldName, ...]] = get_args(WorldName)
-_SIMULATED_MODEL: Final = "builtin:sim_gdn"
+_SIMULATED_MODELS: Final = {"network": "builtin:sim_gdn", "edge_network": "builtin:sim_edge"}
 
 
 @dataclass
@@ -96,11 +96,11 @@ def _use_the_model_of_simulated_tips(plan: CellPlan, found: WorldChanges) -> Non
         if plan.sensors[name].spec.capabilities.virtual_time:
             continue
         estimator = plan.cell.sensors[name].estimator
-        model = getattr(estimator, "model", None)
-        if isinstance(model, str) and not model.startswith(BUILTIN):
-            found.settings[f"sensors.{name}.estimator.model"] = _SIMULATED_MODEL
+        model, known = getattr(estimator, "model", None), _SIMULATED_MODELS.get(estimator.kind)
+        if isinstance(model, str) and known is not None and not model.startswith(BUILTIN):
+            found.settings[f"sensors.{name}.estimator.model"] = known
             found.notes.append(
-                f"{name}: {_SIMULATED_MODEL} in place of {Path(model).name}, which has learnt another sensor's images"
+                f"{name}: {known} in place of {Path(model).name}, which has learnt another sensor's images"
             )
 
 

@@ -118,17 +118,29 @@ class YamlFile:
         if kind == "union_tag_not_found":
             tag = str(context["discriminator"]).strip("'")
             return self.problem((*path, tag), "is missing", hint=f"add `{tag}:`")
+        if kind in ("too_short", "too_long"):
+            least = kind == "too_short"
+            wanted = context["min_length" if least else "max_length"]
+            return self.problem(
+                path,
+                f"needs at {'least' if least else 'most'} {wanted}, found {context['actual_length']}",
+                value=value,
+                hint="add one" if least else "leave out the others",
+            )
         if value is None and kind != "value_error":
             return self.problem(path, "has no value", hint="write one behind the colon, or leave the key out")
         reason = detail["msg"].removeprefix("Value error, ")
         reason = reason.replace("Input should be", "must be").replace("valid dictionary", "mapping")
         reason = reason.replace("a valid tuple", "a list").replace("a valid list", "a list")
+        reason = re.sub(r" or instance of \w+", " of keys", reason)
         reason = re.sub(
             r"^Unable to parse input string as an? (\w+), exceeded maximum size", r"must be a valid \1", reason
         )
         reason = re.sub(r", unable to (parse|interpret) .*", "", reason)
         shown = "" if isinstance(value, dict | list) else f", not {_short(value)}"
         hint = "write it in quotes" if kind == "string_type" and isinstance(value, int | float | bool) else ""
+        if reason.endswith("must be a mapping of keys"):
+            hint = "write its keys and values below it"
         return self.problem(path, reason[:1].lower() + reason[1:] + shown, value=value, hint=hint)
 
     def _unknown_key(self, path: KeyPath, key: str, models: Sequence[type[BaseModel]], value: Any) -> ConfigError:

@@ -45,7 +45,7 @@ class Executor(Protocol):
     ) -> Iterator[tuple[int, Any]]:
         """Yield (index, ``work(items[index])``) for every item, in the order in which they finish.
 
-        A piece of work that ends without a result yields ``Lost``; the others go on. ``work`` and the items are
+        A piece of work that ends without a result yields ``Lost``; the others continue. ``work`` and the items are
         pickled. Closing the iterator, or an interrupt, ends what runs.
         """
         ...

@@ -1,6 +1,6 @@
 """Robustness map: where one arm brings the large square prism to its target, over starts, friction and mass, and speed.
 
-Truth differs from what the controllers are told in the two quantities of each map; everything else is the shipped cell.
+Truth differs from what the controllers assume in the two quantities of each map; everything else is the shipped cell.
 """
 
 from __future__ import annotations

@@ -53,7 +53,7 @@ MATCHED = "matched"
 
 
 def sampled_truth(mass_g: float, friction: float, sensors: Sequence[str], arms: Sequence[str]) -> dict[str, Any]:
-    """Return a ``truth:`` section in which nothing is quite what the controllers are told.
+    """Return a ``truth:`` section in which nothing is quite what the controllers assume.
 
     The tip is the one fitted to the images of a real sensor, with another camera than the network was trained on.
 
@@ -169,7 +169,7 @@ class Arms:
         return changes
 
     def sampling(self, pushed: Pushed, surface: str) -> dict[str, Any]:
-        """Return cell keys under which truth is sampled apart from what the controllers are told."""
+        """Return cell keys under which truth is sampled apart from what the controllers assume."""
         arms = (self.leader, "follower")[: len(self.sensors)]
         start_mm = self.around(pushed, surface, PUSH_HEIGHT_MM)[f"arms.{self.leader}.start_pose_mm_deg"]
         changes: dict[str, Any] = {"truth": sampled_truth(pushed.mass_g, TABLES[surface], self.sensors, arms)}

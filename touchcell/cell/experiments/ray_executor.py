@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -19,7 +20,7 @@ def run(work: Callable[[Any], Any], items: Sequence[Any], workers: Workers) -> I
     for module in cloudpickle.list_registry_pickle_by_value():
         ray.cloudpickle.register_pickle_by_value(sys.modules[module])
     here = {} if workers.address else {"num_cpus": workers.jobs, "include_dashboard": False}
-    ray.init(address=workers.address or "local", log_to_driver=False, **here)
+    ray.init(address=workers.address or "local", log_to_driver=False, logging_level=logging.WARNING, **here)
     try:
         limited = LimitedWork(work, workers.time_limit_s)
 

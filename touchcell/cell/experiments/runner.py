@@ -79,10 +79,11 @@ def run_experiment(
     executor: str = "local",
     keep_stale: bool = False,
     live: bool = False,
+    as_html: bool = False,
 ) -> TrialsResult:
     """Run missing trials, then write table and figures into ``folder``.
 
-    The table says so if trials that are kept were run by other code.
+    The table marks kept trials that were run by other code.
 
     Args:
         experiment: its spec.
@@ -92,9 +93,10 @@ def run_experiment(
         executor: name of what runs the trials, with ``:ADDRESS`` where it takes one.
         keep_stale: keep finished trials of other code, too.
         live: show progress.
+        as_html: also write ``report.html``, whose plots are interactive.
 
     Raises:
-        ConfigError: there is no such executor.
+        ConfigError: there is no such executor, or plotly is missing.
         WorkerDiffers: a worker elsewhere has other code.
         KeyboardInterrupt: every finished trial is kept.
     """
@@ -103,8 +105,8 @@ def run_experiment(
     finished = perform_all(
         perform, experiment.trials(scale), workers=workers, executor=executor, live=live, title=experiment.name
     )
-    rows = table_rows(finished)
-    text = table(f"{experiment.name}: {experiment.summary}", rows, experiment.columns, experiment.paper)
+    rows, title = table_rows(finished), f"{experiment.name}: {experiment.summary}"
+    text = table(title, rows, experiment.columns, experiment.paper)
     pictures = [] if any(each.broken for each in finished) else experiment.draw(finished, folder)
     lines = [
         text,
@@ -115,6 +117,12 @@ def run_experiment(
         *(f"  {picture.name}" for picture in pictures),
     ]
     whole = "\n".join(lines)
+    if as_html:
+        # plotly is an extra.
+        from touchcell.cell.experiments.html_report import write_experiment_html
+
+        page = write_experiment_html(title, experiment.columns, finished, whole, pictures, folder)
+        whole += f"\n  {page.name}"
     (folder / "summary.txt").write_text(whole + "\n")
     (folder / "summary.json").write_text(json.dumps(_summary(experiment, scale, rows, finished), indent=1) + "\n")
     return TrialsResult(whole, tuple(finished))

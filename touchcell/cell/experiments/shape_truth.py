@@ -1,4 +1,4 @@
-"""Rows of experiments with shapes: each with each estimator, some with truth sampled apart from what is told."""
+"""Rows of experiments with shapes: each with each estimator, some with truth sampled apart from what is declared."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ SAMPLED: Final = "truth sampled"
 
 
 def sampled_truth(sensor: str, arm: str) -> dict[str, Any]:
-    """Return a ``truth:`` section: another mount, slip law, camera and delay than the cell file tells."""
+    """Return a ``truth:`` section: another mount, slip law, camera and delay than the cell file declares."""
     return {
         "arms": {arm: {"latency_ms": {"uniform": [0, 10]}, "lag_ms": {"uniform": [2, 10]}}},
         "sensors": {

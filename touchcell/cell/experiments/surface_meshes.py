@@ -13,6 +13,7 @@ import numpy as np
 
 from touchcell.cell.analysis.felt_cloud import felt_cloud, write_ply
 from touchcell.cell.analysis.run_folder import RunFolder, during, rms, tilt_deg, true_contacts
+from touchcell.cell.errors import RecordingError
 from touchcell.cell.experiments import surface_following
 from touchcell.cell.experiments.runner import ExperimentSpec, Scale
 from touchcell.cell.experiments.sample_meshes import FILES, HEIGHTS_MM
@@ -61,7 +62,11 @@ def _start_mm(name: str) -> float:
 
 def measure(trial: RunFolder) -> Mapping[str, float]:
     """Return RMS errors while the task ran, how much of the area was covered, and how far the felt cloud is off."""
-    cloud = felt_cloud(trial, SENSOR)
+    try:
+        cloud = felt_cloud(trial, SENSOR)
+    except RecordingError:
+        # It ended before it followed anything: its outcome says why.
+        return {}
     write_ply(cloud, trial.path / "felt.ply")
     series, contacts = true_contacts(trial, SENSOR)
     running = contacts[during(trial, series)]

@@ -199,7 +199,7 @@ class Perform:
         return Finished.of(trial, RunFolder(folder), record)
 
     def _record(self, trial: Trial, data: dict[str, Any], folder: Path) -> dict[str, Any]:
-        started = time.perf_counter()
+        started, cpu_started = time.perf_counter(), time.process_time()
         digests = file_digests(data)
         settings = settings_digest(data, digests)
         if "collect" in data:
@@ -219,6 +219,7 @@ class Perform:
             "duration_s": result.duration_s,
             "truth": dict(plan.truth),
             "wall_s": round(time.perf_counter() - started, 3),
+            "cpu_s": round(time.process_time() - cpu_started, 3),
             # Measures that are not finite are left out, as JSON has no number for them.
             "measures": {name: float(value) for name, value in measures.items() if math.isfinite(value)},
         }

@@ -31,18 +31,25 @@ class Collection:
         root: its folder; created if missing.
         shares: number of samples per cycle that go to each split, in turn ("train": 3, "val": 1).
         about: how it is taken; a collection with other settings is not continued.
+        defaults: of settings that a collection begun by an earlier version does not name.
 
     Raises:
         ConfigError: the folder holds a collection with other settings, or something else.
         RecordingError: the folder cannot be written.
     """
 
-    def __init__(self, root: Path, shares: Mapping[str, int], about: Mapping[str, Any]) -> None:
+    def __init__(
+        self,
+        root: Path,
+        shares: Mapping[str, int],
+        about: Mapping[str, Any],
+        defaults: Mapping[str, Any] | None = None,
+    ) -> None:
         self.root = root
         self._turn = [split for split, count in shares.items() for _ in range(count)]
         try:
             root.mkdir(parents=True, exist_ok=True)
-            self._begin({"shares": dict(shares), **about})
+            self._begin({"shares": dict(shares), **about}, defaults or {})
             self.kept = sum(self._whole_rows(split) for split in shares)
             self._has_rest = (root / REST_IMAGE).exists()
         except OSError as error:
@@ -76,7 +83,7 @@ class Collection:
             raise RecordingError(path, f"cannot be written: {error.strerror}") from None
         self._has_rest = True
 
-    def _begin(self, about: Mapping[str, Any]) -> None:
+    def _begin(self, about: Mapping[str, Any], defaults: Mapping[str, Any]) -> None:
         file = self.root / _ABOUT
         # Round trip through JSON, so that tuples equal the lists that they become.
         about = json.loads(json.dumps(about))
@@ -86,7 +93,7 @@ class Collection:
                     "the folder is not empty", key="collect.data", value=str(self.root), hint="name a new one"
                 )
             file.write_text(json.dumps(about, indent=1) + "\n")
-        elif json.loads(file.read_text()) != about:
+        elif {**json.loads(json.dumps(defaults)), **json.loads(file.read_text())} != about:
             raise ConfigError(
                 "the folder holds samples taken with other settings",
                 key="collect.data",

@@ -63,7 +63,7 @@ class FrameCompressor:
         self.error: Exception | None = None
 
     def add(self, role: str, t_ns: int, image: ImageArray) -> None:
-        """Take one image of the sensor of a role, which nobody changes later.
+        """Take one image of the sensor of a role, which must not change later.
 
         Args:
             role: of the sensor.

@@ -1,6 +1,6 @@
 """Protobuf types of recorded messages, made from a declaration of their fields: schema, encoder and decoder in one.
 
-A type is declared by its fields (``messages.py`` has those of a cell). Where a plug-in records fields that nobody has
+A type is declared by its fields (``messages.py`` has those of a cell). Where a plug-in records fields that none has
 declared, the type grows with the first message that has them, under the same name.
 """
 
@@ -234,7 +234,7 @@ def message_class(full_name: str, schema: bytes) -> type[Message]:
 
 
 def camel_case(topic: str) -> str:
-    """Return a type's name for a topic that nobody has declared: ``/devices/ft/reading`` is DevicesFtReading."""
+    """Return a type's name for a topic without a declaration: ``/devices/ft/reading`` is DevicesFtReading."""
     parts = [part for part in re.split(r"\W+|_", topic) if part]
     name = "".join(part[0].upper() + part[1:] for part in parts)
     return name if name[:1].isalpha() and name.isascii() else f"Topic{name.encode().hex()}"

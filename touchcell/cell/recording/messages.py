@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any, Final
 
 import numpy as np
 
 from touchcell.cell.recording.message_types import Kind, MessageType, camel_case
+from touchcell.control.interlocks.level import Level
 from touchcell.control.supervisor import Verdict
 from touchcell.drivers.core.commands import Sent, TwistCommand
 from touchcell.drivers.core.samples import Stamped, TcpState
@@ -57,6 +59,16 @@ _DECLARED: Final = {
     ("sensors", "measurement"): MessageType("Measurement", {"seq": Kind.INTEGER, **_POSE, **_SIGMA}),
     ("sensors", "truth"): MessageType("TrueContact", {"in_contact": Kind.FLAG, **_POSE}),
     ("objects",): MessageType("ObjectPose", _POSE),
+    ("interlocks",): MessageType(
+        "Levels",
+        {
+            "interlock": Kind.TEXTS,
+            "subject": Kind.TEXTS,
+            "value": Kind.REALS,
+            "limit": Kind.REALS,
+            "unit": Kind.TEXTS,
+        },
+    ),
     ("safety",): MessageType("Verdict", {"allow": Kind.FLAG, "speed": Kind.REAL, "violations": Kind.TEXTS}),
     ("events",): MessageType("Event", dict.fromkeys(("event", "from", "to", "reason"), Kind.TEXT)),
     ("task",): MessageType("Task", {"state": Kind.TEXT}),
@@ -118,6 +130,17 @@ def verdict_message(verdict: Verdict) -> dict[str, Any]:
         "allow": verdict.allow,
         "speed": verdict.speed,
         "violations": [f"{v.severity.name.lower()} {v.interlock}: {v.subject}: {v.reason}" for v in verdict.violations],
+    }
+
+
+def levels_message(levels: Sequence[tuple[str, Level]]) -> dict[str, Any]:
+    """Return what is on its way to the limits of interlocks: one item of each list for each."""
+    return {
+        "interlock": [name for name, _ in levels],
+        "subject": [level.subject for _, level in levels],
+        "value": [level.value for _, level in levels],
+        "limit": [level.limit for _, level in levels],
+        "unit": [level.unit for _, level in levels],
     }
 
 

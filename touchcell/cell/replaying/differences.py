@@ -37,7 +37,7 @@ class Difference:
         t_s: (n,) times since the first cycle that were compared.
         linear, angular: (n,) absolute differences, mm and degrees, of contacts, mm/s and deg/s of twists; empty for
             others.
-        others: texts of the times at which something is there in only one of both, or is another one.
+        others: texts of the times at which something is in only one of both, or differs.
         tolerance: of linear and angular; NaN where there is none.
     """
 

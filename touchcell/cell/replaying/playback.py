@@ -32,7 +32,7 @@ _SIGMA_UNITS = np.array([1e-3] * 3 + [np.pi / 180] * 3)
 
 
 class Playback(Clock):
-    """Clock of a replay: whoever sleeps until the next cycle wakes at the next one that was recorded.
+    """Clock of a replay: a sleep until the next cycle ends at the next recorded one.
 
     Args:
         run: what is replayed.
@@ -54,7 +54,7 @@ class Playback(Clock):
         return self._now_ns
 
     def sleep_until_ns(self, t_ns: int) -> None:
-        """Go on to the next recorded cycle; behind the last one, to ``t_ns``."""
+        """Advance to the next recorded cycle; behind the last one, to ``t_ns``."""
         if self._index + 1 < len(self._cycles):
             self._index += 1
             self._now_ns = max(self._now_ns, self.cycle.now_ns)
@@ -228,7 +228,8 @@ class RecordedDevice(_Recorded):
 class RecordedContacts(ContactSource):
     """The contact estimates of a run without images, as they were.
 
-    Covariances are recorded by their standard deviations alone, so correlations are missing.
+    Covariances are recorded by their standard deviations alone, so correlations are missing. As in a run, cycles
+    without a new estimate have the same belief object: tasks count each once.
 
     Args:
         role: of the sensor.
@@ -238,6 +239,7 @@ class RecordedContacts(ContactSource):
     def __init__(self, role: str, playback: Playback) -> None:
         self._role = role
         self._playback = playback
+        self._belief: PoseGaussian | None = None
 
     def take_zero(self) -> bool:
         """Compare with nothing."""
@@ -252,17 +254,25 @@ class RecordedContacts(ContactSource):
         data = cycle.contacts.get(self._role)
         if data is None:
             return None
-        measured = cycle.measurements.get(self._role, {})
+        belief, before = _belief(data), self._belief
+        if belief is not None and before is not None and _same(belief, before):
+            belief = before
+        self._belief = belief
+        t_frame_ns = int(data.get("t_frame_ns", now_ns))
+        row = cycle.measurements.get(self._role, {})
+        measured = _belief(row) if row.get("seq") == data.get("seq") else None
+        # Without a filter the estimate is that of the frame; a filter brings it to the present.
+        unfiltered = belief is not None and measured is not None and np.array_equal(belief.mean, measured.mean)
         return ContactEstimate(
             bool(data.get("in_contact", False)),
-            _belief(data),
-            int(data.get("t_frame_ns", now_ns)),
+            belief,
+            t_frame_ns,
             int(data.get("seq", 0)),
-            now_ns,
+            t_frame_ns if unfiltered else now_ns,
             in_range=bool(data.get("in_range", True)),
             nis=_number(data.get("nis")),
             markers=_number(data.get("markers")),
-            measured=_belief(measured) if measured.get("seq") == data.get("seq") else None,
+            measured=measured,
             refusal=str(data.get("refusal", "")),
             change=_number(data.get("change")),
         )
@@ -274,6 +284,10 @@ def _belief(data: Row) -> PoseGaussian | None:
         return None
     sigma = np.array([_number(data.get(name)) or 0.0 for name in _SIGMAS]) * _SIGMA_UNITS
     return PoseGaussian(se3.inverse(T_f_s), np.diag(sigma**2))
+
+
+def _same(first: PoseGaussian, second: PoseGaussian) -> bool:
+    return np.array_equal(first.mean, second.mean) and np.array_equal(first.covariance, second.covariance)
 
 
 def _number(value: Any) -> float | None:

@@ -65,12 +65,14 @@ class RecordedRun:
         cycles: until the task ended, or until an operator let it start again.
         with_images: roles of the sensors whose images were recorded.
         resumed: whether the run went on after a reset, which is not part of ``cycles``.
+        lossy: whether images were recorded as video or JPEG, which changes them a little.
     """
 
     file: Path
     cycles: tuple[RecordedCycle, ...]
     with_images: frozenset[str]
     resumed: bool
+    lossy: bool = False
 
     def images(self, role: str) -> Iterator[RecordedImage]:
         """Yield the recorded images of one sensor in their order, decoded one by one."""
@@ -91,7 +93,7 @@ def read_run(file: Path) -> RecordedRun:
             break
     if not reader.cycles:
         raise RecordingError(file, "holds no control cycle", hint="a run that ended before it began has none to replay")
-    return RecordedRun(file, tuple(reader.cycles), frozenset(reader.with_images), reader.resumed)
+    return RecordedRun(file, tuple(reader.cycles), frozenset(reader.with_images), reader.resumed, reader.lossy)
 
 
 class _CycleReader:
@@ -100,7 +102,7 @@ class _CycleReader:
     def __init__(self) -> None:
         self.cycles: list[RecordedCycle] = []
         self.with_images: set[str] = set()
-        self.resumed = False
+        self.resumed = self.lossy = False
         self._seq: defaultdict[str, int] = defaultdict(int)
         self._next = RecordedCycle()
         self._waiting = False
@@ -135,6 +137,7 @@ class _CycleReader:
                 cycle.measurements[role] = data
             case ["sensors", role, _] if is_image(message.topic):
                 self.with_images.add(role)
+                self.lossy = self.lossy or data.get("format") != "png"
             case ["devices", role, "reading"]:
                 values = {key: value for key, value in data.items() if key != "seq"}
                 cycle.readings[role] = Stamped(values, t_ns, int(data.get("seq", 0)))

@@ -25,7 +25,7 @@ _ADDRESSES: Final = ("host", "port", "channel", "device")
 
 
 class BenchTaken(TouchcellError):
-    """Somebody else uses a device of the bench.
+    """Another process uses a device of the bench.
 
     Attributes:
         device: its name in the cell.
@@ -59,7 +59,7 @@ def bench_lock(plan: CellPlan, folder: Path | None = None) -> Iterator[None]:
         folder: where locks are kept; None for the machine's own, which all its users share.
 
     Raises:
-        BenchTaken: somebody else holds one of them.
+        BenchTaken: another process holds one of them.
     """
     folder = folder or Path(tempfile.gettempdir()) / "touchcell-bench"
     if not folder.is_dir():

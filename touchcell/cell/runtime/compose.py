@@ -186,4 +186,6 @@ def _collection(plan: CellPlan) -> Collection | None:
         return None
     # More samples of the same kind may be asked for later.
     about = {"cell": plan.cell.name, **plan.task_config.model_dump(exclude={"samples"})}
-    return Collection(section.data, dict(section.shares.items()), about)
+    settings = type(plan.task_config).model_fields.items()
+    defaults = {name: field.default for name, field in settings if name in about and not field.is_required()}
+    return Collection(section.data, dict(section.shares.items()), about, defaults)

@@ -6,21 +6,17 @@ moves for the dead-man time, and a held key moves for as long as it repeats.
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Final
 
+from touchcell.cell.runtime.jog_settings import JogSettings
 from touchcell.cell.runtime.operator_channel import OperatorChannel, OperatorRequest, operator_name
 from touchcell.cell.runtime.stop_request import StopRequest
-from touchcell.drivers.core.jog import Axes, JogFrame, JogMode, JogRequest
+from touchcell.drivers.core.jog import Axes, JogButton, JogMode, JogRequest
 from touchcell.drivers.core.samples import Stamped
 
-SHARES: Final = (0.02, 0.1, 0.2, 0.5, 1.0)
-"""Shares of the full speed that ``+`` and ``-`` choose from."""
-STEPS_MM: Final = (0.1, 0.5, 1.0, 2.0, 5.0)
-"""Steps that they choose from in steps; a step of 1 mm goes with one of 1 deg."""
 HELP: Final = (
     "move  u/j x   i/k y   o/l z, capital letters turn about them; arrow keys and page up/down move too",
     "f frame   m steps   t until touch   b back off   + - faster, slower   tab next arm   z zero",
@@ -39,6 +35,18 @@ _SEQUENCES: Final = {
     b"\x1bOC": "u",
     b"\x1bOD": "j",
 }
+_BUTTONS: Final = {
+    "f": JogButton.FRAME,
+    "F": JogButton.FRAME,
+    "m": JogButton.STEPS,
+    "M": JogButton.STEPS,
+    "t": JogButton.UNTIL_TOUCH,
+    "T": JogButton.UNTIL_TOUCH,
+    "\t": JogButton.NEXT_ARM,
+    "+": JogButton.MORE,
+    "=": JogButton.MORE,
+    "-": JogButton.LESS,
+}
 _TOKEN: Final = re.compile(rb"\x1b\[[0-9;]*[A-Za-z~]|\x1bO[A-Z]|.", re.DOTALL)
 _STEP_HELD_NS: Final = 1_000_000_000
 """A step is asked for until it is done, as long as the terminal is there; no step takes longer."""
@@ -51,32 +59,6 @@ def _deflection(key: str) -> Axes:
     axis, sign = number % 6 // 2 + (3 if number >= 6 else 0), 1.0 if number % 2 == 0 else -1.0
     x, y, z, a, b, c = (sign if k == axis else 0.0 for k in range(6))
     return x, y, z, a, b, c
-
-
-@dataclass(frozen=True, slots=True)
-class JogSettings:
-    """How the next key moves.
-
-    Attributes:
-        arm: role of the arm.
-        frame: along whose axes.
-        steps: whether a key moves by a step.
-        until_touch: whether it moves until something is touched.
-        share: index of the share of the full speed.
-        step: index of the step.
-    """
-
-    arm: str
-    frame: JogFrame = JogFrame.BASE
-    steps: bool = False
-    until_touch: bool = False
-    share: int = 2
-    step: int = 2
-
-    def describe(self) -> str:
-        """Return the settings for a status line."""
-        how = f"step {STEPS_MM[self.step]:g} mm/deg" if self.steps else f"speed {100 * SHARES[self.share]:g} %"
-        return f"{self.arm}  {self.frame.value} frame  {how}{'  until touch' if self.until_touch else ''}"
 
 
 class JogKeyboard:
@@ -156,7 +138,7 @@ class JogKeyboard:
                 ask = OperatorRequest.RESET if key in "rR" else OperatorRequest.RESUME
                 self._channel.ask(ask, operator_name())
             case "b" | "B":
-                self._ask(JogRequest(self.settings.arm, JogMode.RETRACT, share=SHARES[self.settings.share]), now_ns)
+                self._ask(self.settings.retraction(), now_ns)
             case "z" | "Z":
                 self._ask(JogRequest(self.settings.arm, JogMode.ZERO), now_ns)
                 self.message = f"zero: {self.settings.arm}'s sensors touch nothing now"
@@ -166,34 +148,14 @@ class JogKeyboard:
                 self._set(key)
 
     def _set(self, key: str) -> None:
-        now = self.settings
-        change = 1 if key in "+=" else -1
-        match key:
-            case "f" | "F":
-                frames = tuple(JogFrame)
-                now = replace(now, frame=frames[(frames.index(now.frame) + 1) % len(frames)])
-            case "m" | "M":
-                now = replace(now, steps=not now.steps, until_touch=False)
-            case "t" | "T":
-                now = replace(now, until_touch=not now.until_touch, steps=False)
-            case "\t":
-                now = replace(now, arm=self._arms[(self._arms.index(now.arm) + 1) % len(self._arms)])
-            case "+" | "=" | "-" if now.steps:
-                now = replace(now, step=min(max(now.step + change, 0), len(STEPS_MM) - 1))
-            case "+" | "=" | "-":
-                now = replace(now, share=min(max(now.share + change, 0), len(SHARES) - 1))
-            case _:
-                self.message = f"{key!r} does nothing" if key.isprintable() else ""
-                return
-        self.settings, self.message = now, ""
+        button = _BUTTONS.get(key)
+        if button is None:
+            self.message = f"{key!r} does nothing" if key.isprintable() else ""
+        else:
+            self.settings, self.message = self.settings.after(button, self._arms), ""
 
     def _press(self, key: str, now_ns: int) -> None:
-        now = self.settings
-        mode = JogMode.STEP if now.steps else JogMode.UNTIL_TOUCH if now.until_touch else JogMode.FREE
-        step_mm = STEPS_MM[now.step]
-        share = 1.0 if now.steps else SHARES[now.share]
-        axes = _deflection(key)
-        self._ask(JogRequest(now.arm, mode, axes, now.frame, share, 1e-3 * step_mm, math.radians(step_mm)), now_ns)
+        self._ask(self.settings.request(_deflection(key)), now_ns)
 
     def _ask(self, request: JogRequest, now_ns: int) -> None:
         self.message = ""

@@ -2,7 +2,7 @@
 
 One thread. Its states are those of ``touchcell.cell.runtime.run_states``. Whatever goes wrong, all arms are commanded
 to stop before anything else happens, each is watched until it stands, and the run ends in a report, or waits for the
-operator if its cell file says so.
+operator if its cell file asks for it.
 """
 
 from __future__ import annotations

@@ -13,13 +13,13 @@ import json
 import logging
 import os
 import socket
-import struct
 from collections import deque
-from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
 from typing import Any, Final
+
+from touchcell.cell.runtime.local_socket import connect, listen, peer_uid
 
 SOCKET: Final = "operator.socket"
 MAX_BYTES: Final = 1024
@@ -28,7 +28,6 @@ MAX_BYTES: Final = 1024
 _WAIT_S: Final = 10.0
 _MOST_CLIENTS: Final = 8
 _LONGEST_NAME: Final = 64
-_CREDENTIALS: Final = struct.Struct("3i")
 
 logger = logging.getLogger(__name__)
 
@@ -77,7 +76,7 @@ class OperatorChannel:
         self._open = True
         if self._folder is not None:
             try:
-                self._server = _serve(self._folder)
+                self._server = listen(self._folder, SOCKET, _MOST_CLIENTS)
             except OSError as error:
                 logger.warning("%s: no requests from other shells: %s", self._folder, error)
 
@@ -122,7 +121,7 @@ class OperatorChannel:
             except OSError:
                 # Nobody is there, or went away in the meantime.
                 return
-            if (uid := _peer_uid(client)) not in (os.getuid(), 0):
+            if (uid := peer_uid(client)) not in (os.getuid(), 0):
                 logger.warning("a request of user %d was refused", uid)
                 client.close()
                 continue
@@ -158,7 +157,7 @@ def operator_name() -> str:
 def is_waiting(folder: Path) -> bool:
     """Whether the run in ``folder`` has tripped and waits for its operator."""
     try:
-        with _connected(folder, _WAIT_S):
+        with connect(folder, SOCKET, _WAIT_S):
             return True
     except OSError:
         return False
@@ -167,55 +166,12 @@ def is_waiting(folder: Path) -> bool:
 def ask_run(folder: Path, ask: OperatorRequest, operator: str, wait_s: float = _WAIT_S) -> tuple[bool, str]:
     """Ask the waiting run in ``folder``; returns whether it was done, and the run's reply."""
     try:
-        with _connected(folder, wait_s) as client:
+        with connect(folder, SOCKET, wait_s) as client:
             client.send(json.dumps({"ask": ask.value, "operator": operator}).encode())
             answer = json.loads(client.recv(MAX_BYTES))
             return bool(answer["done"]), str(answer["reply"])
     except (OSError, ValueError, KeyError, TypeError):
         return False, "no answer: does the run still wait?"
-
-
-def _serve(folder: Path) -> socket.socket:
-    """A listening socket in ``folder`` that only this user may connect to. Raises OSError."""
-    server = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    try:
-        with _address(folder) as address:
-            with contextlib.suppress(FileNotFoundError):
-                (folder / SOCKET).unlink()
-            server.bind(address)
-            # Nobody can connect before it listens.
-            (folder / SOCKET).chmod(0o600)
-        server.setblocking(False)
-        server.listen(_MOST_CLIENTS)
-    except OSError:
-        server.close()
-        raise
-    return server
-
-
-@contextlib.contextmanager
-def _connected(folder: Path, wait_s: float) -> Iterator[socket.socket]:
-    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as client, _address(folder) as address:
-        client.settimeout(max(wait_s, 1e-3))
-        client.connect(address)
-        if _peer_uid(client) not in (os.getuid(), 0) and os.getuid() != 0:
-            raise PermissionError(f"{folder}: the run belongs to another user")
-        yield client
-
-
-@contextlib.contextmanager
-def _address(folder: Path) -> Iterator[str]:
-    """The socket's address by way of a descriptor: a path in an address has 107 bytes at most."""
-    fd = os.open(folder, os.O_PATH | os.O_DIRECTORY)
-    try:
-        yield f"/proc/self/fd/{fd}/{SOCKET}"
-    finally:
-        os.close(fd)
-
-
-def _peer_uid(connection: socket.socket) -> int:
-    _, uid, _ = _CREDENTIALS.unpack(connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size))
-    return int(uid)
 
 
 def _stays(client: socket.socket) -> bool:

@@ -14,6 +14,7 @@ from touchcell.cell.recording.messages import (
     command_message,
     contact_message,
     declared_type,
+    levels_message,
     pose_message,
     tcp_message,
     values_message,
@@ -39,6 +40,8 @@ from touchcell.tasks.interface import Action
 logger = logging.getLogger(__name__)
 
 _EVENTS: Final = "/events"
+_LEVELS_NS: Final = 100_000_000
+"""Time between two looks at how near the interlocks are to their limits, which people watch."""
 
 
 class Box(Protocol):
@@ -65,6 +68,7 @@ class RunRecord:
         self._encoder = recorder.encoder if recorder is not None else Encoder(declared_type)
         self._transitions_written = 0
         self._zeros = 0
+        self._levels_ns = -(1 << 62)
         self._viewers: ViewerRecord | None = None
         self._frames: FrameCompressor | None = None
         kind = cell.plan.cell.recording.frames
@@ -147,6 +151,9 @@ class RunRecord:
             self.write("/safety", now_ns, verdict_message(verdict))
             if self._viewers is not None:
                 self._view(partial(self._viewers.violations, now_ns, verdict.violations))
+        if now_ns >= self._levels_ns:
+            self._levels_ns = now_ns + _LEVELS_NS
+            self.write("/interlocks", now_ns, levels_message(cell.supervisor.levels()))
         self.write("/task", now_ns, {"state": cell.task.state, **action.telemetry})
         self.write("/timing", now_ns, times.message())
         if self._viewers is not None:
@@ -225,12 +232,12 @@ class RunRecord:
         }
 
     def _draw(self, viewers: ViewerRecord, reading: Reading, objects: Stamped[Mapping[str, Array]] | None) -> None:
-        """Record for viewers where everything is."""
+        """Record for viewers where everything is, as often as they show it."""
+        if not viewers.is_due(reading.now_ns):
+            return
         for role, state in reading.states.items():
             viewers.arm(role, state)
         for role, arm in self._jointed.items():
-            if not viewers.wants_joints(role, reading.now_ns):
-                continue
             try:
                 joints = arm.joints()
             except DeviceError:

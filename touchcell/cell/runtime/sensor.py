@@ -34,7 +34,7 @@ class Sensor:
         truth: what is known to be true: the simulator's own contact, or the label of a replayed image.
         true_edge: the simulator's own edge, for an estimator of edges.
         frames: how images are recorded.
-        watched: whether an interlock looks at the pictures.
+        watched: whether an interlock reads the images.
     """
 
     source: ContactSource

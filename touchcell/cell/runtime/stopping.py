@@ -14,6 +14,7 @@ from typing import Final
 
 import numpy as np
 
+from touchcell.control.interlocks.boundary import REST_M_S
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.errors import DeviceError
 from touchcell.drivers.core.protocols import ServoArm, StopCategory
@@ -30,7 +31,7 @@ class StopReport:
 
     Attributes:
         category: by which it was commanded to stop first.
-        speed_m_s: of its tool centre point when it was told; None where it could not be read.
+        speed_m_s: of its tool centre point when it was commanded to; None where it could not be read.
         time_s: until it stood; None if it never did.
         distance_m: farthest way from where it was told; None where it could not be read.
         declared_s, declared_m: what it may take.
@@ -172,23 +173,22 @@ class Stopper:
         except Exception as error:
             problem = f"cannot be watched, for its limits are not known: {error!r}"
             return _Stopping(arm, category, now_ns, None, None, 0.0, 0.0, now_ns, problem=problem)
-        turn_s = limits.rot_speed_rad_s / limits.rot_accel_rad_s2
+        # An arm that cannot tell its speed is given the time that its fastest motion would need.
+        linear_m_s, angular_rad_s, age_s = limits.speed_m_s, limits.rot_speed_rad_s, 0.0
         try:
             sample = arm.tcp()
         except Exception:
             sample = None
         if sample is not None and self._tells(sample, now_ns):
-            state = sample.value
+            state, age_s = sample.value, max(0.0, sample.age_s(now_ns))
             start, speed_m_s = state.T_base_tcp[:3, 3].copy(), math.hypot(*state.twist[:3])
-            turn_s = math.hypot(*state.twist[3:]) / limits.rot_accel_rad_s2
-        # An arm that cannot tell its speed is given the time that its fastest motion would need; one that can may have
-        # become faster since its state was measured.
-        fastest = limits.speed_m_s
-        if speed_m_s is not None and sample is not None:
-            gained_m_s = limits.accel_m_s2 * max(0, now_ns - sample.t_ns) * 1e-9
-            fastest = max(speed_m_s, min(speed_m_s + gained_m_s, limits.speed_m_s))
-        declared_s, declared_m = declared_stop(fastest, limits.accel_m_s2)
-        declared_s = max(declared_s, turn_s + STOP_MARGIN_S)
+            linear_m_s = _by_now(speed_m_s, limits.accel_m_s2 * age_s, limits.speed_m_s)
+            angular_rad_s = _by_now(math.hypot(*state.twist[3:]), limits.rot_accel_rad_s2 * age_s, angular_rad_s)
+        declared_s, declared_m = declared_stop(linear_m_s, limits.accel_m_s2)
+        # The way is measured from where the state was, so what it moved since counts too. Positions of an arm that
+        # stands are as noisy as what counts as standing.
+        declared_m = max(declared_m + linear_m_s * age_s, REST_M_S * STOP_MARGIN_S)
+        declared_s = max(declared_s, angular_rad_s / limits.rot_accel_rad_s2 + STOP_MARGIN_S)
         deadline_ns = now_ns + round(1e9 * declared_s)
         return _Stopping(arm, category, now_ns, start, speed_m_s, declared_s, declared_m, deadline_ns)
 
@@ -233,6 +233,11 @@ class Stopper:
         # It has its second deadline all the same.
         with suppress(Exception):
             arm.stop(_strongest(arm))
+
+
+def _by_now(measured: float, gained: float, limit: float) -> float:
+    """Return the largest speed that an arm may have now, which has gained at most so much since it was measured."""
+    return max(measured, min(measured + gained, limit))
 
 
 def _strongest(arm: ServoArm) -> StopCategory:

@@ -54,7 +54,7 @@ def cell_in_world(
 
     Raises:
         ConfigError: see ``plan_in_world``.
-        BenchTaken: somebody else uses a device of the bench.
+        BenchTaken: another process uses a device of the bench.
         ConnectError, TransportTimeout: an emulator does not start.
     """
     if world != "emulated":

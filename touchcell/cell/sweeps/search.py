@@ -46,7 +46,7 @@ def search(
     """Minimise the magnitude of ``measure`` over ``space``.
 
     A trial that trips or fails is infeasible, whatever its measure. The search is deterministic and its trials are
-    kept, so the same call goes on where it was interrupted.
+    kept, so the same call resumes where it was interrupted.
 
     Args:
         sweep: the cell, with settings in place of the file's own; its factors are not used.

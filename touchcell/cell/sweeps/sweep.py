@@ -30,7 +30,7 @@ _MOST_SHOWN: Final = 6
 
 @dataclass(frozen=True, slots=True)
 class Sweep:
-    """What to run, and what to look at.
+    """What to run, and what to measure.
 
     Attributes:
         cell: the cell file.

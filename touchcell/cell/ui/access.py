@@ -21,8 +21,8 @@ App: TypeAlias = Callable[[Scope, Receive, Send], Awaitable[None]]
 
 TOKEN: Final = "token"
 COOKIE: Final = "touchcell"
-MOST_CLIENTS: Final = 8
-"""Pages that are open at the same time."""
+MOST_CLIENTS: Final = 16
+"""WebSockets that are open at the same time; a page has one, and one more where it moves an arm."""
 _LONGEST: Final = 256
 _logger = logging.getLogger(__name__)
 

@@ -16,8 +16,13 @@ _END_S: Final = 3.0
 
 
 @contextmanager
-def page_beside(folder: Path, port: int) -> Iterator[None]:
+def page_beside(folder: Path, port: int, *, moves: bool = False) -> Iterator[None]:
     """Serve the page of a run from a process of its own within the context; it prints its address itself.
+
+    Args:
+        folder: of the run.
+        port: on the loopback interface.
+        moves: whether the page moves the arms: what is held on it then waits for no other process.
 
     Raises:
         ConfigError: NiceGUI is not installed.
@@ -26,7 +31,14 @@ def page_beside(folder: Path, port: int) -> Iterator[None]:
 
     if find_spec("nicegui") is None:
         raise ConfigError("needs nicegui, which is not installed", key="--ui", hint="pip install 'touchcell[ui]'")
-    command = [sys.executable, "-m", "touchcell.cell.ui.beside", str(folder), str(port)]
+    command = [
+        sys.executable,
+        "-m",
+        "touchcell.cell.ui.beside",
+        str(folder),
+        str(port),
+        *(["--moves"] if moves else []),
+    ]
     # In a session of its own, Ctrl-C in the terminal reaches the run alone.
     process = subprocess.Popen(command, stdin=subprocess.DEVNULL, start_new_session=True)
     try:
@@ -42,15 +54,19 @@ def page_beside(folder: Path, port: int) -> Iterator[None]:
 
 def main() -> int:
     """Serve until the parent has gone."""
-    from touchcell.cell.ui.server import serve_page
+    from touchcell.cell.ui.server import NICE, serve_page
 
     parent, folder = os.getppid(), Path(sys.argv[1])
+    nice = 0 if "--moves" in sys.argv else NICE
+
+    def orphaned() -> bool:
+        return os.getppid() != parent
 
     def ready(address: str) -> None:
         print(f"page: {address}", flush=True)
 
     try:
-        serve_page(folder.parent, int(sys.argv[2]), ready, run=folder.name, until=lambda: os.getppid() != parent)
+        serve_page(folder.parent, int(sys.argv[2]), ready, run=folder.name, until=orphaned, nice=nice)
     except TouchcellError as error:
         print(f"no page: {error}", file=sys.stderr)
         return 1

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Awaitable
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -11,8 +12,12 @@ from nicegui import run as background
 from nicegui import ui
 
 from touchcell.cell.analysis.trip_report import explain
+from touchcell.cell.recording.mcap import RECORDING
+from touchcell.cell.runtime.black_box import RING
 from touchcell.cell.runtime.operator_channel import OperatorRequest
-from touchcell.cell.ui.run_view import Moment, RunView
+from touchcell.cell.ui.jog_pad import JogPad
+from touchcell.cell.ui.jog_relay import takes_jog
+from touchcell.cell.ui.run_view import Moment, RunView, sources
 from touchcell.cell.ui.runs import Runs, StartedRun, outcome
 from touchcell.errors import TouchcellError
 from touchcell.geometry import se3
@@ -32,6 +37,8 @@ _COLOURS: Final = {
 }
 _UNITS: Final = {"mm": "mm", "deg": "°"}
 _CONTACT_RADIUS_M: Final = 0.004
+_NEAREST_M: Final = 0.42
+"""Distance of the camera from a cell whose arms are drawn by their last links only."""
 
 
 def build_list(runs: Runs) -> None:
@@ -41,9 +48,15 @@ def build_list(runs: Runs) -> None:
         with ui.card().classes("w-full"):
             ui.label("Start a run on simulated devices").classes("text-lg font-medium")
             cells = runs.cells()
+
+            def chosen_cell() -> Path | None:
+                return cells.get(chosen.value)
+
             with ui.row().classes("w-full items-center"):
                 chosen = ui.select(list(cells), label="cell", with_input=True).classes("grow")
-                ui.button("start", icon="play_arrow", on_click=lambda: _start(runs, cells.get(chosen.value)))
+                ui.button("start", icon="play_arrow", on_click=lambda: _start(runs, chosen_cell()))
+                jog = ui.button("move by hand", icon="open_with")
+                jog.props("outline").on_click(lambda: _start(runs, chosen_cell(), by_hand=True))
         with ui.card().classes("w-full"):
             ui.label(f"Runs in {runs.root}").classes("text-lg font-medium")
             place = ui.column().classes("w-full gap-1")
@@ -70,11 +83,11 @@ def build_list(runs: Runs) -> None:
     ui.timer(1.0, refresh)
 
 
-async def _start(runs: Runs, cell: Any) -> None:
+async def _start(runs: Runs, cell: Path | None, *, by_hand: bool = False) -> None:
     if cell is None:
         ui.notify("choose a cell first")
         return
-    started = runs.start(cell)
+    started = runs.start(cell, by_hand=by_hand)
     if isinstance(started, str):
         ui.notify(started, type="negative")
         return
@@ -96,10 +109,10 @@ def _go_when_begun(runs: Runs, started: StartedRun) -> None:
     timer = ui.timer(0.3, look)
 
 
-def build_run(runs: Runs, name: str) -> None:
-    """Build the page of one run."""
+def build_run(runs: Runs, name: str, source: str = RECORDING) -> None:
+    """Build the page of one run, from its recording or one of its black boxes."""
     try:
-        view = runs.view(name)
+        view = runs.view(name, source)
     except TouchcellError as error:
         _header(name)
         ui.label(str(error)).classes("p-4")
@@ -127,6 +140,7 @@ class RunPage:
         self._ticks = 0
         self._was_running: bool | None = None
         self._was_waiting = False
+        self._shown_sources: list[str] = []
         self._t_s: float | None = None
         self._drawn: dict[str, Array] = {}
         self._table = _table(view)
@@ -137,6 +151,7 @@ class RunPage:
         with _header(self._name):
             self._state = ui.badge("…").classes("text-base").props("color=primary")
         with ui.column().classes("w-full max-w-screen-2xl mx-auto p-2 gap-2"):
+            self._sources = ui.row().classes("w-full items-center gap-3")
             self._buttons()
             with ui.card().classes("w-full bg-red-1") as self._trip:
                 self._cause = ui.label().classes("whitespace-pre-wrap font-mono text-sm break-words")
@@ -144,6 +159,10 @@ class RunPage:
             with ui.element("div").classes("w-full grid grid-cols-1 lg:grid-cols-2 gap-2"):
                 with ui.card().classes("w-full min-w-0"):
                     self._scene = self._build_scene()
+                self._jog: JogPad | None = None
+                if self._view.plan.task.name == "jog":
+                    with ui.card().classes("w-full min-w-0") as self._jog_card:
+                        _title("Move by hand")
                 with ui.card().classes("w-full min-w-0"):
                     _title("Interlocks")
                     self._bars = _Bars()
@@ -165,14 +184,11 @@ class RunPage:
                 with ui.card().classes("w-full min-w-0"):
                     _title("Events")
                     self._events = ui.label().classes("whitespace-pre-wrap font-mono text-xs break-words")
-        with (
-            ui.footer().classes("bg-white text-black px-3 py-1 shadow-2"),
-            ui.row().classes("w-full items-center no-wrap") as self._scrub,
-        ):
+        self._scrub = ui.footer(value=False).classes("bg-white text-black px-3 py-1 shadow-2")
+        with self._scrub, ui.row().classes("w-full items-center no-wrap"):
             ui.button(icon="play_arrow", on_click=self._toggle).props("round dense")
             self._slider = ui.slider(min=0.0, max=1.0, step=0.01, value=0.0, on_change=self._moved).classes("grow")
             self._time = ui.label("0.00 s").classes("w-20 text-right")
-        self._scrub.visible = False
         self._playing = False
 
     def _buttons(self) -> None:
@@ -198,14 +214,14 @@ class RunPage:
         if await _confirmed(question, request.value):
             ui.notify(await background.io_bound(self._runs.ask, self._name, request))
 
-    def _refresh(self) -> None:
+    async def _refresh(self) -> None:
         view = self._view
         if self._ticks % _SLOWLY == 0:
             self._look_at_run()
         self._ticks += 1
         end_s = view.end_s
-        if end_s is not None and not self._scrub.visible:
-            self._scrub.visible = True
+        if end_s is not None and not self._scrub.value:
+            self._scrub.show()
             self._slider.props(f"max={end_s:.2f}")
             self._slider.value = self._t_s = end_s
         if self._playing and end_s is not None:
@@ -213,16 +229,32 @@ class RunPage:
             self._playing = self._slider.value < end_s
         elif end_s is not None and self._ticks % _SLOWLY:
             return
-        moment = view.moment(self._t_s)
+        # In a thread: what an operator holds on this page is passed on meanwhile.
+        moment = await background.io_bound(view.moment, self._t_s)
         if moment is not None:
             self._show(moment)
         elif view.problem:
             self._events.text = view.problem
 
+    def _show_sources(self, found: list[str]) -> None:
+        """Offer the recording and the black boxes, where there are any."""
+        if found == self._shown_sources:
+            return
+        self._shown_sources = found
+        self._sources.clear()
+        with self._sources:
+            for source in found if len(found) > 1 else ():
+                if source == self._view.source:
+                    ui.label(_source_title(source)).classes("font-medium")
+                else:
+                    ui.link(_source_title(source), f"/run/{self._name}/{source}")
+
     def _look_at_run(self) -> None:
         """Read from the run's folder whether it is in progress, waits, or has tripped."""
+        self._show_sources(sources(self._view.folder))
         running, waiting = self._view.running, self._view.waiting
         self._controls.visible = running
+        self._show_jog(running and takes_jog(self._view.folder))
         self._reset.set_enabled(waiting)
         self._resume.set_enabled(waiting)
         ended = outcome(self._view.folder)
@@ -232,6 +264,18 @@ class RunPage:
                 ui.timer(0.1, self._explain, once=True)
             else:
                 self._trip.visible = False
+
+    def _show_jog(self, moves: bool) -> None:
+        """Show the buttons that move an arm while the run takes them."""
+        if self._view.plan.task.name != "jog":
+            return
+        self._jog_card.visible = moves
+        if moves and self._jog is None:
+            with self._jog_card:
+                self._jog = JogPad(self._name, list(self._view.plan.arm_roles))
+        elif not moves and self._jog is not None:
+            self._jog.delete()
+            self._jog = None
 
     async def _explain(self) -> None:
         try:
@@ -322,8 +366,12 @@ class RunPage:
                 T_f_s = se3.from_euler_mm_deg(np.array([value for _, value, _ in row.values]))
                 mark.move(*(T_world_sensor @ se3.inverse(T_f_s))[:3, 3].tolist())
         if first and self._drawn:
-            x, y, z = np.mean([T[:3, 3] for name, T in self._drawn.items() if name != "world"], axis=0).tolist()
-            self._scene.move_camera(x + 0.22, y - 0.3, z + 0.2, x, y, z, duration=0.0)
+            points = np.array([T[:3, 3] for name, T in self._drawn.items() if name != "world"])
+            low, high = points.min(axis=0), points.max(axis=0)
+            x, y, z = (0.5 * (low + high)).tolist()
+            # Twice the distance at which what moves would fill the view: links reach beyond their frames.
+            away = max(_NEAREST_M, 1.6 * float(np.linalg.norm(high - low)))
+            self._scene.move_camera(x + 0.52 * away, y - 0.7 * away, z + 0.48 * away, x, y, z, duration=0.0)
 
 
 class _Bars:
@@ -362,6 +410,14 @@ def _header(text: str) -> Any:
         if text != "touchcell":
             ui.label(text).classes("grow truncate")
     return header
+
+
+def _source_title(source: str) -> str:
+    """Return what a source is called: recording, black box, black box 1."""
+    if source == RECORDING:
+        return "recording"
+    number = source.removesuffix(".mcap").partition("-")[2]
+    return f"black box {number}" if number else "black box (left by a crash)" if source == RING else "black box"
 
 
 def _title(text: str) -> None:

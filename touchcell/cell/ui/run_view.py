@@ -27,6 +27,7 @@ from touchcell.cell.config.schema import plan_cell
 from touchcell.cell.recording.mcap import RECORDING, Message, follow, read
 from touchcell.cell.recording.messages import COMPONENTS
 from touchcell.cell.recording.recorded_images import is_image
+from touchcell.cell.runtime.black_box import MESSAGES, RING, read_left_ring
 from touchcell.cell.runtime.operator_channel import is_waiting
 from touchcell.cell.runtime.operator_input import is_running
 from touchcell.cell.scene.description import SceneDescription, describe_scene
@@ -37,8 +38,8 @@ WINDOW_S: Final = 3.0
 """How much of a run in progress is kept; the recording has all of it."""
 _ROWS: Final = 30
 """Newest messages of a topic that a moment is made of: a health reading comes once in 25 cycles."""
-_PICTURE_NS: Final = 200_000_000
-"""Time between two pictures: finding markers takes 70 ms."""
+_PICTURE_NS: Final = 100_000_000
+"""Time between two pictures."""
 _MOST_PICTURES: Final = 3000
 _POLL_S: Final = 0.05
 _EVENTS: Final = 12
@@ -95,11 +96,20 @@ class Moment:
     poses: Mapping[str, Array] = field(default_factory=dict)
 
 
+def sources(folder: Path) -> list[str]:
+    """Return the files of a run that can be shown: its recording, its black boxes, and the ring that a crash leaves."""
+    boxes = [*sorted(folder.glob("blackbox-*.mcap")), folder / MESSAGES]
+    if not is_running(folder):
+        boxes.append(folder / RING)
+    return [path.name for path in (folder / RECORDING, *boxes) if path.is_file()]
+
+
 class RunView:
     """A run's folder as the page shows it; read in a thread of its own from ``start`` to ``close``.
 
     Args:
         folder: the run folder.
+        source: one of ``sources``; only a recording is followed as it grows.
 
     Attributes:
         plan: its cell.
@@ -110,8 +120,9 @@ class RunView:
         ConfigError: the folder holds no readable cell file.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, source: str = RECORDING) -> None:
         self.folder = folder
+        self.source = source
         self.plan: CellPlan = plan_cell(folder / "cell.yaml", to_run=False)
         self.scene: SceneDescription | None = None
         self.problem = ""
@@ -174,16 +185,19 @@ class RunView:
 
     def read(self) -> None:
         """Read the recording to its end, as it grows."""
-        path = self.folder / RECORDING
+        path = self.folder / self.source
         try:
-            if self.running:
+            if self.source == RING:
+                self._run = run_of(read_left_ring(self.folder)[1])
+                return
+            if self.running and self.source == RECORDING:
                 self._take_pictures(self._kept(follow(path, self._wait)))
             if not self._closed.is_set():
-                self._run = load_run(path)
+                self._run = run = load_run(path)
                 with self._lock:
                     missing = not self._pictures
                 if missing:
-                    self._start_ns = self._run.start_ns
+                    self._start_ns = run.start_ns
                     self._take_pictures(read(path, []))
         except TouchcellError as error:
             self.problem = str(error)
@@ -214,9 +228,14 @@ class RunView:
             yield message
 
     def _take_pictures(self, messages: Iterable[Message]) -> None:
-        for picture in contact_pictures(_fewer(messages)):
+        drawn_ns: dict[str, int] = {}
+        # Markers are followed from each image to the next; fewer pictures are drawn than anybody could tell apart.
+        for picture in contact_pictures(messages):
             if self._closed.is_set():
                 return
+            if picture.t_ns - drawn_ns.get(picture.role, -_PICTURE_NS) < _PICTURE_NS:
+                continue
+            drawn_ns[picture.role] = picture.t_ns
             data = cv2.imencode(".jpg", picture.drawn())[1].tobytes()
             with self._lock:
                 times, pictures = self._pictures.setdefault(picture.role, ([], []))
@@ -224,17 +243,6 @@ class RunView:
                 pictures.append(data)
                 if len(pictures) > _MOST_PICTURES:
                     del times[0], pictures[0]
-
-
-def _fewer(messages: Iterable[Message]) -> Iterator[Message]:
-    """Leave out images that come sooner than anybody sees. A video's packets build on each other: all are kept."""
-    last_ns: dict[str, int] = {}
-    for message in messages:
-        if message.topic.endswith("/image"):
-            if message.t_ns - last_ns.get(message.topic, -_PICTURE_NS) < _PICTURE_NS:
-                continue
-            last_ns[message.topic] = message.t_ns
-        yield message
 
 
 def _end_s(run: Run) -> float:
@@ -277,12 +285,35 @@ def _moment(
 
 def _bars(run: Run, plan: CellPlan) -> Iterator[Bar]:
     found = list(watched_quantities(run, plan))
+    series = run.series("/interlocks")
+    levels = [] if series is None else list(_levels(series.rows[-1]))
     for name, entry in plan.cell.interlocks.items():
-        mine = [each for each in found if each.interlock == name]
-        if not mine:
-            yield Bar(name, "", f"{entry.kind}: armed; the recording has no such quantity", None)
-        for each in mine:
-            yield _bar(each)
+        mine = [_bar(each) for each in found if each.interlock == name]
+        mine = mine or [_level_bar(*each, entry.kind) for each in levels if each[0] == name]
+        if mine:
+            yield from mine
+        elif series is not None and (limit_ms := getattr(entry, "limit_ms", None)) is not None:
+            # A timer that does not run.
+            yield Bar(name, "", f"{entry.kind.replace('_', ' ')} 0 of {limit_ms:.4g} ms", 0.0)
+        else:
+            yield Bar(name, "", f"{entry.kind.replace('_', ' ')}: armed; nothing of it is recorded", None)
+
+
+def _levels(row: Mapping[str, Any]) -> Iterator[tuple[str, str, float, float, str]]:
+    """Yield interlock, subject, value, limit and unit."""
+    lists = [row.get(key) or [] for key in ("interlock", "subject", "value", "limit", "unit")]
+    for name, subject, value, limit, unit in zip(*lists, strict=False):
+        yield str(name), str(subject), _number(value), _number(limit), str(unit)
+
+
+def _number(value: Any) -> float:
+    return float(value) if isinstance(value, int | float) else float("nan")
+
+
+def _level_bar(name: str, subject: str, value: float, limit: float, unit: str, kind: str) -> Bar:
+    text = f"{kind.replace('_', ' ')} {value:.3g} of {limit:.4g} {unit}".rstrip()
+    fraction = value / limit if limit > 0.0 and np.isfinite(value) else 0.0
+    return Bar(name, subject, text, float(np.clip(fraction, 0.0, 1.0)))
 
 
 def _bar(quantity: WatchedQuantity) -> Bar:

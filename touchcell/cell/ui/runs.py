@@ -15,7 +15,7 @@ from typing import Final
 from touchcell.cell.recording.mcap import RECORDING
 from touchcell.cell.runtime.operator_channel import OperatorRequest, ask_run, operator_name
 from touchcell.cell.runtime.operator_input import NoSuchRun, ask_to_stop, is_running
-from touchcell.cell.ui.run_view import RunView
+from touchcell.cell.ui.run_view import RunView, sources
 from touchcell.paths import CONFIGS
 
 _MOST_VIEWS: Final = 6
@@ -62,7 +62,7 @@ class Runs:
     def __init__(self, root: Path, cells: Path) -> None:
         self.root = root
         self._cells = cells
-        self._views: OrderedDict[str, RunView] = OrderedDict()
+        self._views: OrderedDict[tuple[str, str], RunView] = OrderedDict()
         self._started: list[StartedRun] = []
 
     def listed(self) -> list[ListedRun]:
@@ -83,20 +83,25 @@ class Runs:
         folder = self.folder(name)
         return folder is not None and (folder / RECORDING).exists()
 
-    def view(self, name: str) -> RunView | None:
+    def view(self, name: str, source: str = RECORDING) -> RunView | None:
         """Return the view of a run, which is read from now on; None for a name that is none of them.
+
+        Args:
+            name: of the run.
+            source: its recording, or one of its black boxes.
 
         Raises:
             ConfigError: its cell file cannot be read.
         """
         folder = self.folder(name)
-        if folder is None:
+        if folder is None or (source != RECORDING and source not in sources(folder)):
             return None
-        view = self._views.get(name)
+        key = name, source
+        view = self._views.get(key)
         if view is None:
-            view = self._views[name] = RunView(folder)
+            view = self._views[key] = RunView(folder, source)
             view.start()
-        self._views.move_to_end(name)
+        self._views.move_to_end(key)
         while len(self._views) > _MOST_VIEWS:
             self._views.popitem(last=False)[1].close()
         return view
@@ -125,15 +130,22 @@ class Runs:
         shipped = {f"{path.stem} (ships with touchcell)": path for path in sorted(CONFIGS.glob("*.yaml"))}
         return {**own, **shipped}
 
-    def start(self, cell: Path, more: Sequence[str] = ()) -> StartedRun | str:
-        """Start a run on simulated devices; returns why not where it cannot be started."""
+    def start(self, cell: Path, more: Sequence[str] = (), *, by_hand: bool = False) -> StartedRun | str:
+        """Start a run on simulated devices; returns why not where it cannot be started.
+
+        Args:
+            cell: the cell file.
+            more: arguments of the command.
+            by_hand: whether its arms are moved from the page, in place of its task.
+        """
         self._started = [each for each in self._started if each.process.poll() is None]
         if len(self._started) >= _MOST_STARTED:
             return f"{_MOST_STARTED} runs that were started here are still in progress"
         self.root.mkdir(parents=True, exist_ok=True)
-        name = f"{cell.stem}-{datetime.now(UTC).astimezone():%Y%m%d-%H%M%S}"
+        name = f"{cell.stem}{'-jog' if by_hand else ''}-{datetime.now(UTC).astimezone():%Y%m%d-%H%M%S}"
         log = self.root / f".{name}.log"
-        command = [sys.executable, "-m", "touchcell", "run", str(cell), "--on", "sim", "--quiet"]
+        word = ["jog", str(cell), "--input", "page"] if by_hand else ["run", str(cell), "--quiet"]
+        command = [sys.executable, "-m", "touchcell", *word, "--on", "sim"]
         command += ["--out", str(self.root / name), "--set", "recording.frames=jpeg", *more]
         with log.open("wb") as stream:
             process = subprocess.Popen(
@@ -144,7 +156,7 @@ class Runs:
         return started
 
     def close(self) -> None:
-        """Read nothing more; runs that were started go on."""
+        """Read nothing more; runs that were started continue."""
         for view in self._views.values():
             view.close()
 

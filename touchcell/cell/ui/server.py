@@ -11,12 +11,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
+from touchcell.cell.recording.mcap import RECORDING
 from touchcell.cell.ui.access import TOKEN, Access, App
 from touchcell.cell.ui.runs import Runs
 from touchcell.errors import ConfigError
 
 HOST: Final = "127.0.0.1"
-_NICE: Final = 10
+NICE: Final = 10
+"""A page never competes with the run that it shows."""
 _BACKLOG: Final = 64
 _WATCH_S: Final = 0.5
 _EXTRA: Final = "pip install 'touchcell[ui]'"
@@ -30,6 +32,7 @@ def serve_page(
     run: str | None = None,
     token: str | None = None,
     until: Callable[[], bool] | None = None,
+    nice: int = NICE,
 ) -> None:
     """Serve the page until the process is interrupted.
 
@@ -40,6 +43,7 @@ def serve_page(
         run: name of the run that the address shows; None for the list.
         token: secret of this server; None makes one.
         until: asked twice a second; the page ends when it returns True.
+        nice: added to this process's niceness.
 
     Raises:
         ConfigError: NiceGUI is not installed, or the port is taken.
@@ -58,8 +62,7 @@ def serve_page(
         _quiet_about_clients()
         path = "/" if run is None else f"/run/{run}"
         ready(f"http://{HOST}:{port}{path}?{TOKEN}={token}")
-        # A page never competes with the run that it shows.
-        os.nice(_NICE)
+        os.nice(nice)
         try:
             asyncio.run(_serve(uvicorn.Server(config), listener, until))
         except KeyboardInterrupt:
@@ -82,15 +85,20 @@ async def _serve(server: Any, listener: socket.socket, until: Callable[[], bool]
 def page_app(runs: Runs) -> App:
     """Return the page as an ASGI application, without protection. Raises ConfigError if NiceGUI is not installed."""
     try:
-        from fastapi import FastAPI, Response
+        from fastapi import FastAPI, Response, WebSocket
         from nicegui import ui
     except ModuleNotFoundError:
         raise ConfigError("needs nicegui, which is not installed", key="touchcell ui", hint=_EXTRA) from None
+    from touchcell.cell.ui.jog_relay import JogRelay
     from touchcell.cell.ui.page import build_list, build_run
     from touchcell.cell.ui.stl import stl
     from touchcell.geometry.solids import triangulated
 
     app = FastAPI(openapi_url=None)
+    relay = JogRelay()
+
+    async def jog(socket: WebSocket, name: str) -> None:
+        await relay.serve(socket, runs.folder(name))
 
     def part(name: str, number: int) -> Response:
         view = runs.view(name)
@@ -101,12 +109,16 @@ def page_app(runs: Runs) -> App:
     def index() -> None:
         build_list(runs)
 
-    def run(name: str) -> None:
-        build_run(runs, name)
+    def run(name: str, source: str = RECORDING) -> None:
+        build_run(runs, name, source)
 
+    # FastAPI reads the type of a parameter from its annotation, which is local here.
+    jog.__annotations__["socket"] = WebSocket
+    app.add_api_websocket_route("/jog/{name}", jog)
     app.add_api_route("/part/{name}/{number}.stl", part)
     ui.page("/", title="touchcell")(index)
     ui.page("/run/{name}", title="touchcell")(run)
+    ui.page("/run/{name}/{source}", title="touchcell")(run)
     ui.run_with(app, show_welcome_message=False, reconnect_timeout=3.0)
     found: App = app
     return found

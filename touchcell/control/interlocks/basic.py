@@ -25,6 +25,7 @@ from touchcell.control.interlocks.coverage import (
     with_sensor,
 )
 from touchcell.control.interlocks.interlock import Interlock
+from touchcell.control.interlocks.level import Level
 from touchcell.control.interlocks.planning_scene import PlanningScene, SpatialInterlockConfig
 from touchcell.control.interlocks.settings import LEAVE, GradedSettings, InterlockSettings
 from touchcell.control.interlocks.snapshot import CellView
@@ -189,6 +190,11 @@ class ArmStateAge:
                 return _missing(self, "state", role, view.now_ns)
         stamps = [(arm.state.t_ns, role, None) for role, arm in view.arms.items()]
         return _check_ages(self, "newest state", stamps, view.now_ns)
+
+    def levels(self, view: CellView, past: InterlockState) -> Iterator[Level]:
+        """Yield the age of each arm's newest state."""
+        for role, arm in view.arms.items():
+            yield Level(role, 1e-6 * (view.now_ns - arm.state.t_ns), 1e3 * self.limit_s, "ms")
 
 
 def _missing(rule: FrameAge | ArmStateAge, what: str, role: str, now_ns: int) -> Violation:

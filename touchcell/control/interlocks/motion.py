@@ -20,6 +20,7 @@ from touchcell.control.interlocks.coverage import (
     with_arm,
     with_motion,
 )
+from touchcell.control.interlocks.level import Level
 from touchcell.control.interlocks.settings import LEAVE, InterlockSettings
 from touchcell.control.interlocks.snapshot import CellView
 from touchcell.control.interlocks.spec import InterlockSpec
@@ -71,6 +72,13 @@ class Standstill:
                     self.name, self.severity, role, reason, view.now_ns, value=drift_m, limit=self.limit_m, unit="m"
                 )
         return found, marks
+
+    def levels(self, view: CellView, past: InterlockState) -> Iterator[Level]:
+        """Yield how far each arm that has been commanded to stop has drifted."""
+        for role, arm in view.arms.items():
+            mark = past.get(role)
+            drift_m = math.dist(arm.state.value.T_base_tcp[:3, 3], mark.values) if mark and mark.values else 0.0
+            yield Level(role, 1e3 * drift_m, 1e3 * self.limit_m, "mm")
 
 
 def _tracking_errors(view: CellView) -> Iterator[Reading]:

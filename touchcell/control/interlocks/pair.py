@@ -26,6 +26,7 @@ from touchcell.control.interlocks.coverage import (
     with_motion,
     with_sensor,
 )
+from touchcell.control.interlocks.level import Level
 from touchcell.control.interlocks.planning_scene import PlanningScene, SpatialInterlockConfig
 from touchcell.control.interlocks.settings import LEAVE
 from touchcell.control.interlocks.snapshot import CellView, SensorView
@@ -41,6 +42,7 @@ from touchcell.control.interlocks.timers import (
     number_state,
     overdue,
     select_state,
+    waited,
 )
 from touchcell.control.interlocks.violation import Severity
 from touchcell.drivers.core.samples import TcpState
@@ -154,6 +156,10 @@ class ObjectLost:
             return f"no contact, and {other} still pushes" if touching[other] else "neither sensor has contact"
 
         return overdue(self.name, self.severity, view, marks, self.limit_s, words), marks
+
+    def levels(self, view: CellView, past: InterlockState) -> Iterator[Level]:
+        """Yield for how long contacts have been missing."""
+        yield from waited(view, past, self.limit_s)
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,6 +21,7 @@ from touchcell.control.interlocks.coverage import (
     unchanged,
     with_sensor,
 )
+from touchcell.control.interlocks.level import Level
 from touchcell.control.interlocks.settings import LEAVE, GradedSettings, InterlockSettings
 from touchcell.control.interlocks.snapshot import CellView
 from touchcell.control.interlocks.spec import InterlockSpec
@@ -33,6 +34,7 @@ from touchcell.control.interlocks.timers import (
     TimedInterlock,
     TimerState,
     overdue,
+    waited,
 )
 from touchcell.control.interlocks.violation import Severity, Violation
 from touchcell.geometry.types import Array
@@ -60,6 +62,10 @@ class FrameFrozen:
                 mark = TimerState(view.now_ns, values=identity)
             marks[role] = mark
         return overdue(self.name, self.severity, view, marks, self.limit_s, lambda _: "the same picture"), marks
+
+    def levels(self, view: CellView, past: InterlockState) -> Iterator[Level]:
+        """Yield for how long each image has been the same."""
+        yield from waited(view, past, self.limit_s)
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,6 +106,14 @@ class Exposure:
             marks[role] = mark
         return found, marks
 
+    def levels(self, view: CellView, past: InterlockState) -> Iterator[Level]:
+        """Yield by how much each brightness is off."""
+        for role, sensor in view.sensors.items():
+            mark = past.get(role)
+            if sensor.brightness is not None and mark is not None and mark.count >= _BASELINE_FRAMES:
+                change = 100.0 * abs(sensor.brightness / max(mark.values[0], 1e-6) - 1.0)
+                yield Level(role, change, self.limit_percent, "%")
+
 
 @dataclass(frozen=True, slots=True)
 class ContactLost:
@@ -121,6 +135,10 @@ class ContactLost:
         }
         words = f"no contact in {view.task_state}"
         return overdue(self.name, self.severity, view, marks, self.limit_s, lambda _: words), marks
+
+    def levels(self, view: CellView, past: InterlockState) -> Iterator[Level]:
+        """Yield for how long contacts have been missing."""
+        yield from waited(view, past, self.limit_s)
 
 
 def _depth_deviations(view: CellView) -> Iterator[Reading]:

@@ -6,11 +6,12 @@ is a pure function like the others; the supervisor keeps the states of all inter
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Final, Protocol, runtime_checkable
 
+from touchcell.control.interlocks.level import Level
 from touchcell.control.interlocks.snapshot import CellView
 from touchcell.control.interlocks.violation import Severity, Violation
 
@@ -61,6 +62,15 @@ class TimedInterlock(Protocol):
         ...
 
 
+@runtime_checkable
+class Levelled(Protocol):
+    """An interlock whose quantities can be watched."""
+
+    def levels(self, view: CellView, past: InterlockState) -> Iterable[Level]:
+        """Return the quantities in ``view``, given the timer states after it was evaluated."""
+        ...
+
+
 @dataclass(frozen=True, slots=True)
 class Reading:
     """A number measured on one arm or sensor in this cycle, and the number of the frame that it comes from."""
@@ -97,6 +107,11 @@ class Sustained:
     def evaluate(self, view: CellView, past: InterlockState) -> Judgement:
         """Return a violation for the first subject that is above for too long."""
         return self.over(view, self.measure(view), past)
+
+    def levels(self, view: CellView, past: InterlockState) -> Iterator[Level]:
+        """Yield the readings beside the limit."""
+        for reading in self.measure(view):
+            yield Level(reading.subject, reading.value, self.limit, self.unit)
 
     def over(self, view: CellView, readings: Iterable[Reading], past: InterlockState) -> Judgement:
         """Evaluate readings that the caller has taken."""
@@ -152,6 +167,12 @@ class AnyOf:
             found = found or violation
         return found, marks
 
+    def levels(self, view: CellView, past: InterlockState) -> Iterator[Level]:
+        """Yield the quantities of each of its interlocks."""
+        for k, rule in enumerate(self.rules):
+            if isinstance(rule, Levelled):
+                yield from rule.levels(view, select_state(past, k))
+
 
 def select_state(past: InterlockState, number: int) -> InterlockState:
     """Return the state of interlock ``number`` of several under one name."""
@@ -183,6 +204,16 @@ class OnDelay:
         matters = self.condition(view)
         marks = {subject: past.get(subject, TimerState(view.now_ns)) for subject in matters}
         return overdue(self.name, self.severity, view, marks, self.limit_s, lambda s: matters[s]), marks
+
+    def levels(self, view: CellView, past: InterlockState) -> Iterator[Level]:
+        """Yield for how long the condition has lasted, where it does."""
+        yield from waited(view, past, self.limit_s)
+
+
+def waited(view: CellView, past: InterlockState, limit_s: float) -> Iterator[Level]:
+    """Yield for how long each condition has lasted."""
+    for subject, mark in past.items():
+        yield Level(subject, 1e-6 * (view.now_ns - mark.since_ns), 1e3 * limit_s, "ms")
 
 
 def overdue(

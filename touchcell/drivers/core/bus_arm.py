@@ -57,7 +57,7 @@ class BusArmConfig(DriverConfig):
     than ``max_missed_fraction`` of the cycles without all replies is a fault.
 
     Attributes:
-        chain: name of a chain description that ships, or path of a YAML file.
+        chain: name of a chain description that ships, or path of a YAML or URDF file.
         tool: tool on the flange.
         rate_hz: cycles of the bus per second.
         max_silence_s: oldest reply of a motor; an older one is a fault.
@@ -98,8 +98,8 @@ class BusArmConfig(DriverConfig):
         return self
 
     def described_chain(self) -> SerialChain:
-        """Return the named chain with the configured tool. Raises ConfigError."""
-        return SerialChain(ChainDescription.named(self.chain), self.tool)
+        """Return the named chain with the configured tool. Raises ConfigError, also where joints and motors differ."""
+        return SerialChain(self.named_chain("chain"), self.tool)
 
     def named_chain(self, key: str) -> ChainDescription:
         """Return the chain description of the arm.
@@ -137,6 +137,7 @@ class BusArm(JointArm):
         super().__init__(name, clock, config.limits.build(), max_state_age_s=config.max_silence_s)
         self._config = config
         self._chain = chain
+        chain.accelerate()
         self._ik = DifferentialIk(chain, config.joint_limits.settings())
         self._setpoint = JointSetpoint(chain, self._ik, self.limits)
         self._thread: threading.Thread | None = None

@@ -75,10 +75,9 @@ class TwistGate:
 
     def reset(self) -> None:
         """Forget the last command: the next one is limited as if from rest."""
-        self._last = np.zeros(6)
-        self._last_accel = np.zeros(6)
-        self._last_ns = self._expires_ns = 0
-        self._at_rest = True
+        self._last = self._last_accel = _REST
+        # Earlier than any time.
+        self._last_ns = self._expires_ns = -1
 
     def admit(
         self,
@@ -97,7 +96,7 @@ class TwistGate:
             state: of the arm.
             T_base_tcp: (4, 4) for commands along tool axes.
             follow: asked first what the arm can follow at all.
-            joints: tells where the joints are, asked once the command is found fit; None: they are not limited here.
+            joints: returns the joint positions, called once the command is found fit; None: they are not limited here.
 
         Raises:
             CommandRejected: with the first reason that applies; nothing may be sent.
@@ -106,10 +105,10 @@ class TwistGate:
         command = self._checked(command, lease, state, now_ns)
         wanted, lost = follow(in_base_axes(command, T_base_tcp))
         adjustments = list(lost)
-        if self._at_rest or now_ns > self._expires_ns:
+        if now_ns > self._expires_ns:
             # After a silence longer than the time-to-live the arm stands: limit from rest. When the next command will
             # come is not known, and the time-to-live is much longer than a cycle.
-            self._last, self._last_accel = np.zeros(6), np.zeros(6)
+            self._last = self._last_accel = _REST
             dt_s = min(command.ttl_s, FIRST_STEP_S)
         else:
             dt_s = min(command.ttl_s, (now_ns - self._last_ns) * 1e-9)
@@ -134,7 +133,6 @@ class TwistGate:
         self._last = allowed
         self._last_ns = now_ns
         self._expires_ns = now_ns + round(command.ttl_s * 1e9)
-        self._at_rest = False
         sent = TwistCommand(allowed, TwistFrame.BASE, command.t_ns, command.ttl_s, command.t_cause_ns)
         return Sent(sent, now_ns, tuple(adjustments))
 
@@ -163,9 +161,7 @@ class TwistGate:
                 adjustments.append(Adjustment(f"tcp {name} jerk", asked, jerk))
             if step > jerk * dt_s:
                 share = min(share, jerk * dt_s / step)
-        if share == 1.0 and min(rate, smooth) * dt_s == 1.0:
-            return way
-        return (last + (change if share == 1.0 else share * change)) * dt_s
+        return (last + share * change) * dt_s
 
     def _limited(self, twist: Array, adjustments: list[Adjustment]) -> Array:
         """``twist`` scaled by one factor so that neither part exceeds its speed; CommandRejected if it is not finite.
@@ -184,7 +180,7 @@ class TwistGate:
                 adjustments.append(Adjustment(f"tcp {part} speed", size, limit))
             if size > limit:
                 scale = min(scale, limit / size)
-        return twist if scale == 1.0 else twist * scale
+        return twist * scale
 
     def _checked(self, command: TwistCommand, lease: Lease, state: Lifecycle, now_ns: int) -> TwistCommand:
         """``command`` with values of its own, or the first reason to refuse it."""
@@ -230,10 +226,9 @@ class TwistGate:
 def _within(local: LocalIk, twist: Array, adjustments: list[Adjustment]) -> Array:
     """``twist`` scaled so that no joint exceeds its limits; each joint is named once."""
     _, scale, why = local.limited(twist)
-    if why:
-        named = {adjustment.limit for adjustment in adjustments}
-        adjustments.extend(adjustment for adjustment in why if adjustment.limit not in named)
-    return twist if scale == 1.0 else scale * twist
+    named = {adjustment.limit for adjustment in adjustments}
+    adjustments.extend(adjustment for adjustment in why if adjustment.limit not in named)
+    return scale * twist
 
 
 def _norms(twist: Array) -> tuple[float, float]:
@@ -244,6 +239,7 @@ def _norms(twist: Array) -> tuple[float, float]:
 
 FIRST_STEP_S: Final = 1e-3
 """The time over which a first command from rest may accelerate: the shortest control cycle that a cell may have."""
+_REST = read_only(np.zeros(6))
 _PARTS = ("linear", "angular")
 _NEGLIGIBLE = 1e-12
 _SHORTEST_STEP_S = 1e-6

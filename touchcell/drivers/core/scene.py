@@ -111,7 +111,7 @@ class SceneSection(BaseModel):
         raise NotImplementedError
 
     def bodies(self) -> Sequence[SceneBody]:
-        """Return what there is to draw."""
+        """Return the bodies to draw."""
         return ()
 
     def modules(self) -> Mapping[str, tuple[str, str]]:
@@ -122,8 +122,25 @@ class SceneSection(BaseModel):
         """Return what is wrong with the files that it names; ``key`` of each is relative to the section."""
         return ()
 
-    def remarks(self) -> Iterable[str]:
-        """Return what a sensor cannot follow of it, in a line each."""
+    def pressed(self, tips: Mapping[str, Array]) -> Mapping[str, float]:
+        """Return how deep (m) each tip that touches something at the start is in it.
+
+        Args:
+            tips: T_world_s (4, 4) of each sensor.
+        """
+        return {}
+
+    def has_edges(self) -> bool:
+        """Return whether anything in it has an edge that could be followed."""
+        return True
+
+    def remarks(self, starts: Mapping[str, Array], reach_m: float | None) -> Iterable[str]:
+        """Return what a sensor cannot follow of it, in a line each.
+
+        Args:
+            starts: by the name of the sensor, its pose (4, 4) in the world at the start.
+            reach_m: distance along its axis within which the task expects contact; None where it expects none.
+        """
         return ()
 
 

@@ -41,8 +41,11 @@ class Register(IntEnum):
     TMAX = 23
 
 
-MIT_MODE = 1
-"""Value of ``Register.CTRL_MODE``."""
+MIT_MODE, POSITION_MODE, VELOCITY_MODE, FORCE_MODE = 1, 2, 3, 4
+"""Values of ``Register.CTRL_MODE``: impedance; position at a speed; speed; position at a speed and a torque."""
+
+MODE_ID_STEP = 0x100
+"""A motor hears commands of mode m on its ``esc_id`` plus m - 1 times this."""
 
 _FLOAT_REGISTERS = frozenset([*range(0, 7), *range(11, 13), *range(17, 35), *range(50, 57), *range(59, 66), 80, 81])
 
@@ -72,6 +75,21 @@ class MitCommand:
     kp: float
     kd: float
     tau: float
+
+
+@dataclass(frozen=True, slots=True)
+class LoopCommand:
+    """Command of a mode in which the motor closes the loop itself.
+
+    Attributes:
+        q: goal in rad; NaN in speed mode, which has none.
+        dq: speed, or largest speed on the way to the goal, rad/s.
+        torque_share: largest torque, as a share of ``Ranges.torque_n_m``.
+    """
+
+    q: float
+    dq: float
+    torque_share: float = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,6 +213,21 @@ def decode_mit(data: bytes, ranges: Ranges) -> MitCommand:
         _value(bits >> 12 & 0xFFF, 0.0, KD_MAX, 12),
         _value(bits & 0xFFF, -ranges.torque_n_m, ranges.torque_n_m, 12),
     )
+
+
+def decode_loop(data: bytes, mode: int) -> LoopCommand:
+    """Decode a command of ``POSITION_MODE``, ``VELOCITY_MODE`` or ``FORCE_MODE``. Raises CodecError."""
+    _require_length(data)
+    if mode == VELOCITY_MODE:
+        q, dq, share = math.nan, struct.unpack_from("<f", data)[0], 1.0
+    elif mode == POSITION_MODE:
+        (q, dq), share = struct.unpack("<ff", data), 1.0
+    else:
+        q, speed_steps, share_steps = struct.unpack("<fHH", data)
+        dq, share = speed_steps / 100.0, min(share_steps, 10_000) / 10_000.0
+    if not (math.isfinite(dq) and (mode == VELOCITY_MODE or math.isfinite(q))):
+        raise CodecError("command", data.hex(), "is not finite")
+    return LoopCommand(q, dq, share)
 
 
 def encode_feedback(feedback: Feedback, ranges: Ranges) -> bytes:

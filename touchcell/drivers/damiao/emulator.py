@@ -1,4 +1,4 @@
-"""Emulator of an arm of Damiao motors on a CAN bus: registers, MIT impedance control, in-motor timeout, faults.
+"""Emulator of an arm of Damiao motors on a CAN bus: registers, every control mode, in-motor timeout, faults.
 
 Each motor is a second-order system (inertia, viscous friction, the weight of the arm from its chain description)
 integrated in steps of 0.5 ms. Inertias are constant and uncoupled: this tests protocol and fault handling, not
@@ -14,6 +14,7 @@ import math
 import struct
 import sys
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -22,6 +23,7 @@ import can
 import numpy as np
 
 from touchcell.drivers.core import can_errors
+from touchcell.drivers.core.errors import CodecError
 from touchcell.drivers.damiao import capture, codec
 from touchcell.drivers.damiao.capture_emulator import RecordedArm
 from touchcell.drivers.kinematics.chain import ChainDescription, SerialChain, Tool
@@ -34,6 +36,10 @@ _TICK_S = 2e-3
 _GRAVITY_EVERY = 8
 _ROOM_TEMPERATURE_C = 35.0
 _OVER_TEMPERATURE_C = 100.0
+# Loops within the motor, of this emulator: rad/s per rad and N m per rad/s. Their integrators are ideal: they carry the
+# weight.
+_POSITION_GAIN, _SPEED_GAIN = 20.0, 20.0
+_STORE, _READ, _WRITE, _STATE = 0xAA, 0x33, 0x55, 0xCC
 # Details in an error frame (linux/can/error.h).
 _NO_ACKNOWLEDGEMENT, _PASSIVE_BOTH = 0x020, 0x30
 
@@ -61,6 +67,29 @@ class Motor:
         self.mst_id = mst_id
         self.ranges = ranges
         self.rotor_c = _ROOM_TEMPERATURE_C
+        self.registers: dict[int, float | int] = {
+            codec.Register.MST_ID: mst_id,
+            codec.Register.ESC_ID: esc_id,
+            codec.Register.TIMEOUT: FACTORY_TIMEOUT_TICKS,
+            codec.Register.CTRL_MODE: codec.MIT_MODE,
+            14: 5017,
+            35: 4,
+            codec.Register.PMAX: ranges.position_rad,
+            codec.Register.VMAX: ranges.velocity_rad_s,
+            codec.Register.TMAX: ranges.torque_n_m,
+        }
+        self._factory = dict(self.registers)
+        self.store()
+        self.power_up()
+
+    def store(self) -> None:
+        """Keep the registers beyond the next loss of power."""
+        self._stored = dict(self.registers)
+
+    def reset(self) -> None:
+        """Return to the state in which it was made."""
+        self.registers = dict(self._factory)
+        self.store()
         self.power_up()
 
     def power_up(self) -> None:
@@ -68,17 +97,13 @@ class Motor:
         self.status = codec.DISABLED
         self.command = codec.MitCommand(0.0, 0.0, 0.0, 0.0, 0.0)
         self.heard_s = -math.inf
-        self.registers: dict[int, float | int] = {
-            codec.Register.MST_ID: self.mst_id,
-            codec.Register.ESC_ID: self.esc_id,
-            codec.Register.TIMEOUT: FACTORY_TIMEOUT_TICKS,
-            codec.Register.CTRL_MODE: codec.MIT_MODE,
-            14: 5017,
-            35: 4,
-            codec.Register.PMAX: self.ranges.position_rad,
-            codec.Register.VMAX: self.ranges.velocity_rad_s,
-            codec.Register.TMAX: self.ranges.torque_n_m,
-        }
+        self.goal: codec.LoopCommand | None = None
+        self.registers = dict(self._stored)
+
+    @property
+    def mode(self) -> int:
+        """Control mode, a value of ``codec.Register.CTRL_MODE``."""
+        return int(self.registers[codec.Register.CTRL_MODE])
 
     @property
     def scale(self) -> codec.Ranges:
@@ -172,7 +197,7 @@ class DamiaoArm(Emulator):
             handle.cancel()
         self._under_way.clear()
         for motor in self.motors:
-            motor.power_up()
+            motor.reset()
             motor.rotor_c = _ROOM_TEMPERATURE_C
         self._q = self._start_q.copy()
         self._dq = np.zeros_like(self._q)
@@ -321,6 +346,9 @@ class DamiaoArm(Emulator):
             if self._steps % _GRAVITY_EVERY == 0:
                 self._weight = self._chain.gravity_torques(self._q)
             wanted = kp * (q_set - self._q) + kd * (dq_set - self._dq) + feed
+            for i, motor in enumerate(self.motors):
+                if motor.goal is not None:
+                    wanted[i] = self._loop_torque(motor.goal, i)
             self._tau = np.where(enabled, np.clip(wanted, -strongest, strongest), 0.0)
             acceleration = (self._tau + pushed - self._weight - self._friction * self._dq) / self._inertia
             self._dq = self._dq + _STEP_S * acceleration
@@ -329,6 +357,14 @@ class DamiaoArm(Emulator):
             self._dq = np.where(stopped, 0.0, self._dq)
             self._q = np.clip(self._q, lowest, highest)
             self._steps += 1
+
+    def _loop_torque(self, goal: codec.LoopCommand, index: int) -> float:
+        """Return the torque of a motor that closes the loop itself."""
+        speed = goal.dq
+        if not math.isnan(goal.q):
+            speed = float(np.clip(_POSITION_GAIN * (goal.q - self._q[index]), -abs(goal.dq), abs(goal.dq)))
+        wanted = _SPEED_GAIN * (speed - self._dq[index]) + self._weight[index]
+        return _within(wanted, goal.torque_share * self.motors[index].ranges.torque_n_m)
 
     def _on_frame(self, message: can.Message) -> None:
         if "bus_off" in self.active or message.is_error_frame or message.is_extended_id:
@@ -352,10 +388,11 @@ class DamiaoArm(Emulator):
                     # Both reply with one id and different data: bit errors, until both controllers are off the bus.
                     self._hub.send(_error_frame(can_errors.BUS_ERROR))
                 continue
-            if number == self._esc_id(motor) and self.active.get("silent") != index:
+            mode, esc_id = divmod(number, codec.MODE_ID_STEP) if not parameter else (0, number)
+            if esc_id == self._esc_id(motor) and mode < codec.FORCE_MODE and self.active.get("silent") != index:
                 self._integrate()
                 motor.heard_s = self._now_s()
-                answer = self._on_parameter(index, data) if parameter else self._on_command(index, data)
+                answer = self._on_parameter(index, data) if parameter else self._on_command(index, mode + 1, data)
                 if answer is not None:
                     self._reply(index, answer, message)
 
@@ -363,19 +400,25 @@ class DamiaoArm(Emulator):
     def _esc_id(motor: Motor) -> int:
         return int(motor.registers[codec.Register.ESC_ID])
 
-    def _on_command(self, index: int, data: bytes) -> bytes | None:
+    def _on_command(self, index: int, mode: int, data: bytes) -> bytes | None:
+        """Obey a command that came on the id of ``mode``; a motor in another mode hears only special commands there."""
         motor = self.motors[index]
-        if motor.registers[codec.Register.CTRL_MODE] != codec.MIT_MODE and data[:7] != codec.ENABLE[:7]:
-            # In the other modes a motor listens to other ids (0x100 + id and so on), and not to this one.
+        is_special = data[:7] == codec.ENABLE[:7] and data[7] >= codec.CLEAR_ERROR[7]
+        if motor.mode != mode and not (is_special and mode == codec.MIT_MODE):
             return None
         self._last_command_s = self._now_s()
         self._commands += 1
-        if data[:7] == codec.ENABLE[:7] and data[7] >= codec.CLEAR_ERROR[7]:
+        if is_special:
             self._energising += 1
             self._on_special(index, data)
         elif motor.status == codec.ENABLED:
-            command = codec.decode_mit(data, motor.scale)
-            motor.command = replace(command, q=command.q - self._turned(index))
+            if mode == codec.MIT_MODE:
+                command = codec.decode_mit(data, motor.scale)
+                motor.command = replace(command, q=command.q - self._turned(index))
+            else:
+                with suppress(CodecError):
+                    goal = codec.decode_loop(data, mode)
+                    motor.goal = replace(goal, q=goal.q - self._turned(index))
             self._onset.note(index, data[:5])
         return self._feedback(index)
 
@@ -389,7 +432,7 @@ class DamiaoArm(Emulator):
             return
         if data == codec.ENABLE and motor.status in (codec.DISABLED, codec.ENABLED):
             motor.status = codec.ENABLED
-            motor.command = codec.MitCommand(0.0, 0.0, 0.0, 0.0, 0.0)
+            motor.command, motor.goal = codec.MitCommand(0.0, 0.0, 0.0, 0.0, 0.0), None
             self._on_stand = False
         elif data == codec.DISABLE:
             motor.status = codec.DISABLED if motor.status == codec.ENABLED else motor.status
@@ -405,20 +448,23 @@ class DamiaoArm(Emulator):
     def _on_parameter(self, index: int, data: bytes) -> bytes | None:
         motor = self.motors[index]
         _, operation, register, raw = codec.decode_parameter_request(data)
-        if operation == 0xCC:
+        if operation == _STATE:
             return self._feedback(index)
-        if operation == 0xAA:
+        if operation == _STORE:
+            motor.store()
             return data[:4] + bytes(4)
-        if operation not in (0x33, 0x55) or register not in motor.registers:
+        if operation not in (_READ, _WRITE) or register not in motor.registers:
             return None
-        if operation == 0x55:
+        if operation == _WRITE:
             is_float = isinstance(motor.registers[register], float)
             motor.registers[register] = struct.unpack("<f" if is_float else "<I", raw)[0]
-            self._energising += register == codec.Register.CTRL_MODE
+            if register == codec.Register.CTRL_MODE:
+                self._energising += 1
+                motor.command, motor.goal = codec.MitCommand(0.0, 0.0, 0.0, 0.0, 0.0), None
         value = motor.registers[register]
         if "nan" in self.active and isinstance(value, float):
             value = math.nan
-        return codec.encode_register_reply(motor.esc_id, register, value, write=operation == 0x55)
+        return codec.encode_register_reply(motor.esc_id, register, value, write=operation == _WRITE)
 
     def _feedback(self, index: int) -> bytes:
         motor, ranges = self.motors[index], self.motors[index].scale
@@ -477,7 +523,7 @@ class DamiaoArm(Emulator):
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command-line arguments of ``touchcell emulate damiao``."""
     parser.add_argument("path", type=Path, help="socket of the hub; clients use it as python-can channel")
-    parser.add_argument("--chain", default="generic_6r", help="shipped chain description, or a YAML file")
+    parser.add_argument("--chain", default="generic_6r", help="shipped chain description, or a YAML or URDF file")
     parser.add_argument("--tool", help='tool as JSON, e.g. \'{"origin_mm": [0, 0, 80], "mass_kg": 0.2}\'')
     parser.add_argument("--models", nargs="+", choices=sorted(MODELS), help="motor model per joint")
     parser.add_argument("--start-deg", type=float, nargs="+", default=[0.0, 40.0, 90.0, 0.0, 50.0, 0.0])
@@ -499,10 +545,8 @@ def build(arguments: argparse.Namespace) -> Emulator:
         for line in [*capture.describe(recorded), *(judged or ["nothing contradicts codec or emulator"])]:
             print(line, file=sys.stderr)
         return RecordedArm(arguments.path, recorded)
-    is_file = Path(arguments.chain).suffix == ".yaml"
-    read = ChainDescription.read(Path(arguments.chain)) if is_file else ChainDescription.shipped(arguments.chain)
     tool = Tool.model_validate_json(arguments.tool) if arguments.tool else None
-    chain = SerialChain(read, tool)
+    chain = SerialChain(ChainDescription.named(arguments.chain), tool)
     n = chain.joint_count
     models = arguments.models or ["4340"] * min(3, n) + ["4310"] * max(0, n - 3)
     return DamiaoArm(arguments.path, chain, models, arguments.start_deg, arguments.first_id)

@@ -66,7 +66,7 @@ class KeeperBus:
         return can.BusState.ACTIVE
 
     def tell_offsets(self, offsets: Array) -> None:
-        """Tell the keeper the joints' offsets (n,) rad, turns included, which only a connected client knows."""
+        """Send the keeper the joints' offsets (n,) rad, turns included, which only a connected client knows."""
         with suppress(OSError):
             self._socket.send(_OFFSETS + json.dumps(offsets.tolist()).encode())
 

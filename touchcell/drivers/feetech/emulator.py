@@ -9,6 +9,7 @@ real brown-out lets an arm sink.
 from __future__ import annotations
 
 import asyncio
+import sys
 from collections import deque
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -16,7 +17,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from touchcell.drivers.feetech import codec
+from touchcell.drivers.core.difference import report
+from touchcell.drivers.feetech import capture, codec
+from touchcell.drivers.feetech.capture_emulator import RecordedServos
 from touchcell.drivers.feetech.codec import Instruction, Packet, Register
 from touchcell.drivers.kinematics.chain import ChainDescription, SerialChain, Tool
 from touchcell.testing.emulation.base import CommandOnset, Emulator
@@ -261,6 +264,7 @@ class FeetechArm(Emulator):
             servo.put(Register.PROTECTION_TIME, bytes([round(self._protection_time_s * 100)]))
         self._buffer = b""
         self._held_back: dict[int, bytes] = {}
+        self._rivals: dict[int, Servo] = {}
         self._stepped_s: float | None = None
         self._energising = 0
         self._commands = 0
@@ -404,12 +408,16 @@ class FeetechArm(Emulator):
 
     def _on_packet(self, packet: Packet) -> None:
         data = packet.data
-        listening = {servo.number: servo for index, servo in enumerate(self.servos) if self._hears(index)}
+        hearing = [servo for index, servo in enumerate(self.servos) if self._hears(index)]
+        listening = {servo.number: servo for servo in hearing}
+        # Servos that were given one id both obey, and reply at once.
+        self._rivals = {s.number: r for s in hearing for r in hearing if r is not s and r.number == s.number}
         if "id_clash" in self.active:
             first, second = (self.servos[index] for index in self.active["id_clash"])
             listening.pop(second.number, None)
             if first.number in listening:
                 listening[first.number] = first
+                self._rivals[first.number] = second
         addressed = [s for n, s in listening.items() if packet.servo in (n, codec.BROADCAST_ID)]
         alone = packet.servo != codec.BROADCAST_ID
         if packet.code == Instruction.PING:
@@ -419,7 +427,8 @@ class FeetechArm(Emulator):
         elif packet.code in (Instruction.WRITE, Instruction.REG_WRITE) and data:
             for servo in addressed:
                 if packet.code == Instruction.WRITE:
-                    self._write(servo, data[0], data[1:])
+                    for twin in [each for each in hearing if each.number == servo.number]:
+                        self._write(twin, data[0], data[1:])
                 else:
                     servo.prepared = (data[0], data[1:])
             self._answer([(servo, b"") for servo in addressed if alone and servo.acknowledges])
@@ -461,8 +470,8 @@ class FeetechArm(Emulator):
             if self.spend("drop"):
                 continue
             packet = codec.encode(self._spoilt(Packet(servo.number, servo.status, data)))
-            if "id_clash" in self.active:
-                packet = self._collided(servo, packet, data)
+            if servo.number in self._rivals:
+                packet = self._collided(servo, self._rivals[servo.number], packet, data)
             if self.spend("noise"):
                 packet = _STRAY + packet
             if self.spend("corrupt"):
@@ -478,12 +487,9 @@ class FeetechArm(Emulator):
             else:
                 self._line.write(packet)
 
-    def _collided(self, servo: Servo, packet: bytes, data: bytes) -> bytes:
+    @staticmethod
+    def _collided(servo: Servo, rival: Servo, packet: bytes, data: bytes) -> bytes:
         """Return what the host hears when the other servo of the same id replies at once: its zeros pull the line."""
-        first, second = self.active["id_clash"]
-        if servo is not self.servos[first]:
-            return packet
-        rival = self.servos[second]
         # Another servo stands elsewhere, and its oscillator is never quite in step.
         other = codec.encode(Packet(servo.number, rival.status, bytes(~byte & 0xFF for byte in data)))
         return bytes(a & b for a, b in zip(packet, other[1:] + other[:1], strict=True))
@@ -506,26 +512,37 @@ class FeetechArm(Emulator):
 def add_arguments(parser: Any) -> None:
     """Add the command-line arguments of ``touchcell emulate feetech``."""
     parser.add_argument("--link", type=Path, required=True, help="symbolic link to make; clients open it as a port")
-    parser.add_argument("--chain", default="so101_5r", help="shipped chain description, or a YAML file")
+    parser.add_argument("--chain", default="so101_5r", help="shipped chain description, or a YAML or URDF file")
     parser.add_argument("--tool", help="tool as JSON, e.g. '{\"origin_mm\": [0, 0, 40]}'")
     parser.add_argument("--start-deg", type=float, nargs="+", default=[0.0, 10.0, 90.0, 80.0, 0.0])
     parser.add_argument("--zero-ticks", type=int, nargs="+", help="ticks of each servo at joint angle zero")
     parser.add_argument("--direction", type=int, nargs="+", help="1 or -1 per servo")
+    parser.add_argument(
+        "--from",
+        dest="capture",
+        type=Path,
+        metavar="CAPTURE",
+        help="answer as the servos in this record did (socat -x), after a report of what in it is not as expected",
+    )
     parser.add_argument("--echo", action="store_true", help="the adapter echoes transmitted bytes")
     parser.add_argument("--protection-time-s", type=float, default=2.0, help="overload time of a servo, up to 2.5 s")
 
 
-def build(arguments: Any) -> FeetechArm:
-    """Build the emulator from its command-line arguments."""
+def build(arguments: Any) -> Emulator:
+    """Build the emulator from its command-line arguments. Raises ConfigError."""
     return build_on(PtyLine(arguments.link), arguments)
 
 
-def build_on(line: SerialLine, arguments: Any) -> FeetechArm:
-    """Build the emulator on ``line`` from its other command-line arguments."""
-    is_file = Path(arguments.chain).suffix == ".yaml"
-    read = ChainDescription.read(Path(arguments.chain)) if is_file else ChainDescription.shipped(arguments.chain)
+def build_on(line: SerialLine, arguments: Any) -> Emulator:
+    """Build the emulator on ``line`` from its other command-line arguments. Raises ConfigError."""
+    if arguments.capture is not None:
+        recorded = capture.judge(capture.read_chunks(arguments.capture))
+        found = list(report(recorded.differences)) or ["nothing contradicts codec or emulator"]
+        for text in [*capture.describe(recorded), *found]:
+            print(text, file=sys.stderr)
+        return RecordedServos(line, recorded)
     tool = Tool.model_validate_json(arguments.tool) if arguments.tool else None
-    chain = SerialChain(read, tool)
+    chain = SerialChain(ChainDescription.named(arguments.chain), tool)
     n = chain.joint_count
     return FeetechArm(
         line,

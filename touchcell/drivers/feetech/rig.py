@@ -14,6 +14,7 @@ from touchcell.drivers.core.errors import ConnectError
 from touchcell.drivers.feetech import bus
 from touchcell.drivers.feetech import driver as feetech_serial
 from touchcell.drivers.feetech import emulator as feetech_emulator
+from touchcell.testing.emulation.base import Emulator
 from touchcell.testing.emulation.in_cell import EmulatedDriver, start_arguments, tcp_of_joints
 from touchcell.testing.emulation.lockstep import Lockstep, emulator_in_step
 from touchcell.testing.emulation.process import EmulatorProcess
@@ -78,7 +79,7 @@ def _arguments(port: Path) -> tuple[str, ...]:
     )
 
 
-def _build_on_socket(arguments: Any) -> feetech_emulator.FeetechArm:
+def _build_on_socket(arguments: Any) -> Emulator:
     return feetech_emulator.build_on(SocketLine(arguments.link, config(arguments.link).baudrate), arguments)
 
 

@@ -60,7 +60,8 @@ from touchcell.drivers.core.samples import JointState, Stamped, TcpState, of_oth
 from touchcell.drivers.core.spec import Capabilities, DriverConfig, DriverContext, DriverSpec
 from touchcell.drivers.franka.errors import BY_NAME, ERRORS, MODES, VendorError
 from touchcell.drivers.franka.reader import PERIOD_S, Reading, StateReader
-from touchcell.drivers.kinematics.chain import ChainDescription, DifferentialIk, LocalIk, SerialChain, Tool
+from touchcell.drivers.kinematics.chain import ChainDescription, ChainFile, DifferentialIk, LocalIk, SerialChain, Tool
+from touchcell.errors import ConfigError
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 
@@ -92,12 +93,15 @@ _NEEDS_A_PERSON = ("UserStopped", "Other", "Guiding")
 _READABLE = (Lifecycle.PASSIVE, Lifecycle.READY, Lifecycle.ACTIVE, Lifecycle.FAULTED)
 _REALTIME_KERNEL = Path("/sys/kernel/realtime")
 
+_JOINTS = 7
+
 
 class FrankaConfig(DriverConfig):
     """Configuration of a Franka arm.
 
     Attributes:
         host: address of the controller.
+        chain: name of a chain description that ships, or path of a YAML or URDF file; seven joints.
         limits: speed and acceleration limits of the tool centre point.
         joint_limits: margins to the joint limits, which the controller reports, and to singularities.
         enforce_realtime: refuse to run without a PREEMPT_RT kernel; without one expect communication reflexes.
@@ -112,6 +116,7 @@ class FrankaConfig(DriverConfig):
     """
 
     host: str = Field(min_length=1)
+    chain: ChainFile = "fr3"
     limits: LimitsConfig = LimitsConfig()
     joint_limits: JointLimitsConfig = JointLimitsConfig()
     enforce_realtime: bool = True
@@ -127,10 +132,17 @@ class FrankaConfig(DriverConfig):
         return "host" if is_this_machine(self.host) else None
 
     def described_chain(self) -> SerialChain:
-        """Return the chain of an FR3 with the configured tool, or with none where Desk has set it."""
+        """Return the chain with the configured tool, or with none where Desk has set it. Raises ConfigError."""
         x, y, z, alpha, beta, gamma = self.flange_to_tcp_mm_deg or (0.0,) * 6
         tool = Tool(origin_mm=(x, y, z), rotation_deg=(alpha, beta, gamma))
-        return SerialChain(ChainDescription.shipped("fr3"), tool)
+        return SerialChain(self.arm(), tool)
+
+    def arm(self) -> ChainDescription:
+        """Return the description of the arm. Raises ConfigError for one that does not have seven joints."""
+        found = ChainDescription.named(self.chain)
+        if len(found.joints) != _JOINTS:
+            raise ConfigError(f"has {len(found.joints)} joints, and this arm {_JOINTS}", key="chain", value=self.chain)
+        return found
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,7 +184,7 @@ class FrankaArm(Arm):
         self._contact = threading.Event()
         self._moved_ns = clock.now_ns()
         self._joint_limits = np.zeros((7, 2))
-        self._ik = self._kinematics_of(SerialChain(ChainDescription.shipped("fr3")))
+        self._ik = self._kinematics_of(SerialChain(config.arm()))
 
     def tcp(self, max_age_s: float | None = None) -> Stamped[TcpState]:
         """Return the newest state. Raises StaleData if older than ``max_age_s``, or the fault of the arm.
@@ -402,13 +414,14 @@ class FrankaArm(Arm):
         state = self._robot.state
         tool = se3.to_euler_mm_deg(np.asarray(state.F_T_EE.matrix)).tolist()
         chain = SerialChain(
-            ChainDescription.shipped("fr3").narrowed(np.rad2deg(self._joint_limits)),
+            self._config.arm().narrowed(np.rad2deg(self._joint_limits)),
             Tool(origin_mm=tuple(tool[:3]), rotation_deg=tuple(tool[3:])),
         )
         require_same_arm(self.name, chain, np.asarray(state.q), np.asarray(state.O_T_EE.matrix))
         return self._kinematics_of(chain)
 
     def _kinematics_of(self, chain: SerialChain) -> DifferentialIk:
+        chain.accelerate()
         return DifferentialIk(chain, self._config.joint_limits.settings(own_controller=True))
 
     def _verify_frame(self, name: str, wanted: Array) -> None:

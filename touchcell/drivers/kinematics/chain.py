@@ -7,6 +7,7 @@ numpy only.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Self
@@ -15,7 +16,9 @@ import numpy as np
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from touchcell.drivers.kinematics import urdf
 from touchcell.drivers.kinematics.adjustment import Adjustment
+from touchcell.drivers.kinematics.engine import PinocchioEngine
 from touchcell.drivers.kinematics.joint_limits import (
     IkSettings,
     off_singularity,
@@ -29,8 +32,11 @@ from touchcell.geometry.types import Array
 from touchcell.input_file import InputFile, files_in
 
 _CHAINS = Path(__file__).parent / "chains"
-ChainFile = Annotated[str, InputFile("a chain", files_in(_CHAINS, ".yaml"), suffixes=(".yaml", ".yml"))]
-"""Key of a driver that names a shipped chain or a YAML file with one."""
+ChainFile = Annotated[
+    str,
+    InputFile("a chain", files_in(_CHAINS, ".yaml"), suffixes=(".yaml", ".yml", urdf.SUFFIX), has_parts=True),
+]
+"""Key of a driver that names a shipped chain, a YAML file with one, or a URDF file (``#TIP`` or ``#BASE:TIP``)."""
 
 Vector3 = tuple[float, float, float]
 Positive = Annotated[float, Field(gt=0.0)]
@@ -125,6 +131,15 @@ class ChainDescription(_Description):
             raise ConfigError(f"is not a valid chain description: {error}", file=str(path)) from None
 
     @classmethod
+    def from_urdf(cls, name: urdf.UrdfName) -> ChainDescription:
+        """Read the arm in a URDF file. Raises ConfigError with the file and what is wrong."""
+        fields = urdf.read_chain(name)
+        try:
+            return cls.model_validate(fields)
+        except ValidationError as error:
+            raise ConfigError(f"is not a valid chain: {error}", file=str(name.file)) from None
+
+    @classmethod
     def shipped(cls, name: str) -> ChainDescription:
         """Return a description shipped with touchcell. Raises ConfigError for an unknown name."""
         known = sorted(path.stem for path in _CHAINS.glob("*.yaml"))
@@ -134,7 +149,9 @@ class ChainDescription(_Description):
 
     @classmethod
     def named(cls, chain: str) -> ChainDescription:
-        """Return a shipped description, or read it if ``chain`` is the path of a YAML file. Raises ConfigError."""
+        """Return a shipped description, or read it if ``chain`` names a YAML or URDF file. Raises ConfigError."""
+        if (name := urdf.parse_name(chain)).file.suffix == urdf.SUFFIX:
+            return cls.from_urdf(name)
         return cls.read(Path(chain)) if Path(chain).suffix in (".yaml", ".yml") else cls.shipped(chain)
 
     def narrowed(self, ranges_deg: Array) -> ChainDescription:
@@ -176,6 +193,7 @@ class SerialChain:
         self.speed = np.deg2rad([joint.speed_deg_s for joint in joints])
         self.accel = np.deg2rad([joint.accel_deg_s2 for joint in joints])
         self.torque = np.array([joint.torque_n_m for joint in joints])
+        self._engine: PinocchioEngine | None = None
         self._axes = np.array([np.array(joint.axis) / np.linalg.norm(joint.axis) for joint in joints])
         # Rodrigues' formula, split to place all joints at once: T(q) = fixed + sin q * sine + (1 - cos q) * cosine.
         self._fixed = np.array([joint.pose() for joint in joints])
@@ -187,6 +205,14 @@ class SerialChain:
         self._T_joint_tcp = T_joint_flange @ tool.pose()
         self._mass, self._com = _links(joints, T_joint_flange, tool)
         self._gravity = np.array(gravity_m_s2)
+
+    def accelerate(self) -> bool:
+        """Compute by pinocchio from now on, where it is installed; return whether it is. Takes a moment."""
+        with suppress(ImportError):
+            self._engine = self._engine or PinocchioEngine(
+                self._fixed, self._axes, self._mass, self._com, self._T_joint_tcp, self._gravity
+            )
+        return self._engine is not None
 
     @property
     def joint_count(self) -> int:
@@ -201,6 +227,8 @@ class SerialChain:
 
     def forward(self, q: Array) -> Array:
         """Return the pose ``T_base_tcp`` (4, 4) at ``q`` (n,) rad. Raises GeometryError for a wrong shape or NaN."""
+        if self._engine is not None and self._engine.accepts(q):
+            return self._engine.forward(q)
         return self._place(q)[1]
 
     def link_poses(self, q: Array) -> Array:
@@ -213,6 +241,8 @@ class SerialChain:
 
     def forward_and_jacobian(self, q: Array) -> tuple[Array, Array]:
         """Return pose and Jacobian from one pass, for control loops."""
+        if self._engine is not None and self._engine.accepts(q):
+            return self._engine.forward_and_jacobian(q)
         T_base_joint, T_base_tcp = self._place(q)
         axes = self._axes_in_base(T_base_joint)
         J = np.empty((6, len(axes)))
@@ -222,6 +252,8 @@ class SerialChain:
 
     def gravity_torques(self, q: Array) -> Array:
         """Return the motor torques (n,) N m that hold arm and tool still at ``q``."""
+        if self._engine is not None and self._engine.accepts(q):
+            return self._engine.gravity_torques(q)
         T_base_joint, _ = self._place(q)
         origins = T_base_joint[:, :3, 3]
         moments = self._mass[:, None] * (np.einsum("nij,nj->ni", T_base_joint[:, :3, :3], self._com) + origins)

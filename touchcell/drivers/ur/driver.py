@@ -162,6 +162,7 @@ class UrArm(Arm):
         self._upload = upload
         self._flange_to_tcp = _pose_vector(se3.from_euler_mm_deg(np.array(config.flange_to_tcp_mm_deg)))
         self._chain = config.described_chain()
+        self._chain.accelerate()
         self._ik = DifferentialIk(self._chain, config.joint_limits.settings(own_controller=True))
         # All UR joints but a UR3e's endless wrist turn by a full turn; a little beyond where software limits are wider.
         ends = np.maximum(np.abs(self._chain.lower), np.abs(self._chain.upper))

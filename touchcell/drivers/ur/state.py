@@ -2,7 +2,7 @@
 
 Every packet is one control period. The reader maps it to host time by the controller's own clock, and drops values that
 are not finite, out of range, or older than the newest. RTDE has no checksum: a wrong value within the ranges below
-cannot be detected. No threads: whoever asks for the state reads what has arrived.
+cannot be detected. No threads: a call for the state reads what has arrived.
 """
 
 from __future__ import annotations

@@ -204,7 +204,7 @@ class VideoNode:
         return not query.flags & codec.CTRL_DISABLED
 
     def control(self, identity: int) -> int | None:
-        """Return the present value of a control, or None if the device does not tell it. Raises DeviceGone."""
+        """Return the present value of a control, or None if the device does not report it. Raises DeviceGone."""
         request = codec.Control(id=identity)
         try:
             self._calls.ioctl(self._fd, codec.G_CTRL, request)

@@ -64,7 +64,7 @@ class CameraCheck:
     """Test of marker displacements.
 
     Args:
-        functionals: (15, 2 m) see ``CHECKED``; zero rows belong to symmetries that cannot be told apart.
+        functionals: (15, 2 m) see ``CHECKED``; zero rows belong to symmetries that cannot be distinguished.
         mean: (2 m,) px, mean displacement.
         spacing_px: of the lattice.
         tear: test for torn images; None for none.
@@ -204,7 +204,7 @@ class _Inverse:
 def limited_functionals(
     functionals: NDArray[np.float32], mean: Array, displacements: Array, spacing_px: float
 ) -> NDArray[np.float32]:
-    """Return functionals that accept a sensor's own contacts: what few contacts cannot tell apart refuses none.
+    """Return functionals that accept a sensor's own contacts: what few contacts cannot distinguish refuses none.
 
     With few contacts many a component of how the skin moves is unknown, and is taken for a change of the camera.
 

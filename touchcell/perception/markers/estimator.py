@@ -154,7 +154,15 @@ class MarkerEstimator:
         # The networks' sigmas are valid only for markers that were matched, seen by the model's camera.
         xi, covariance = labels.xi_gaussian(mean, np.maximum(calibrated, 1.0) if refusal else calibrated)
         tail_scale = self.header.tail_scale
-        return Prediction(xi, covariance, in_range, markers=field.score, refusal=refusal, tail_scale=tail_scale)
+        return Prediction(
+            xi,
+            covariance,
+            in_range,
+            markers=field.score,
+            refusal=refusal,
+            tail_scale=tail_scale,
+            displacements=field.displacements,
+        )
 
     def observe(self, sample: Stamped[Frame]) -> Stamped[Prediction]:
         """Apply ``predict`` to a camera's sample; the prediction keeps the stamp, number and quality of the frame."""

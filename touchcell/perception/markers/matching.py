@@ -28,7 +28,7 @@ _FIT_SD_PX = 0.7
 _TURNS = 12
 _SETTLED_PX = 0.1
 _CONVINCING = 0.965
-_COMPLETE = 0.985
+_COMPLETE = 0.96  # Of 900 real images 87 scored between this and 0.985; growing gained none of them a marker.
 _EXPLAINED = 0.985
 _DEAD_PINS = 0.8  # Of the least score: a fifth of the pins may be missing.
 _DEAD_RMS = 0.5
@@ -296,7 +296,7 @@ class MarkerMatcher:
         ridge = (_FIT_SD_PX / prior_sd) ** 2
         coefficients = self._settle(start, start, ridge, centres, self._reach if near else 2.0 * self._reach)
         field = self._field(coefficients, centres)
-        if near or field.score >= _COMPLETE or field.seen.mean() < 0.5:
+        if near or (field.valid and field.score >= _COMPLETE) or field.seen.mean() < 0.5:
             return field
         # Where a part of the rim is off by half a spacing, the correct part is extended to it.
         grown = self._grow(coefficients, start, ridge, centres)

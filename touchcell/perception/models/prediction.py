@@ -32,6 +32,7 @@ class Prediction:
         markers: fraction of the markers expected in view that were detected, for a marker model.
         tail_scale: factor of the covariance that makes it the scale of a Student-t with four degrees of freedom, as
             which large errors are likelier; None for a Gaussian.
+        displacements: (m, 2) px of all markers from where they rest, for a marker model.
         refusal: why the image does not show the contact as the model's camera would; empty where it does.
     """
 
@@ -41,6 +42,7 @@ class Prediction:
     markers: float | None = None
     refusal: str = ""
     tail_scale: float | None = None
+    displacements: Array | None = None
 
     @property
     def sigma(self) -> Array:
@@ -55,17 +57,26 @@ class Prediction:
     @property
     def slip_probability(self) -> float:
         """Probability that the skin has slipped: that the shear exceeds ``SLIP_RATIO`` of the depth."""
-        x, y, depth = self.pose_mm_deg[:3]
-        shear = float(np.hypot(x, y))
-        sx, sy, sz = self.sigma_mm_deg[:3]
-        spread = float(np.hypot(np.hypot(sx, sy) / np.sqrt(2.0), SLIP_RATIO * sz))
-        return 0.5 * (1.0 + math.erf((shear - SLIP_RATIO * float(depth)) / (math.sqrt(2.0) * max(spread, 1e-9))))
+        return slip_probability(self.pose_mm_deg[:3], self.sigma_mm_deg[:3])
 
     @property
     def sigma_mm_deg(self) -> Array:
         """(6,) standard deviation of each component of xi, mm and degrees: along and about the sensor's axes."""
         sigma: Array = self.sigma * np.array([1e3] * 3 + [180.0 / np.pi] * 3)
         return sigma
+
+
+def slip_probability(position: Array, sigma: Array) -> float:
+    """Return the probability that the shear of a contact exceeds ``SLIP_RATIO`` of its depth.
+
+    Args:
+        position: (3,) shear x, y and depth.
+        sigma: (3,) their standard deviations, in the same unit.
+    """
+    x, y, depth = position.tolist()
+    sx, sy, sz = sigma.tolist()
+    spread = math.hypot(math.hypot(sx, sy) / math.sqrt(2.0), SLIP_RATIO * sz)
+    return 0.5 * (1.0 + math.erf((math.hypot(x, y) - SLIP_RATIO * depth) / (math.sqrt(2.0) * max(spread, 1e-9))))
 
 
 class ContactEstimator(Protocol):

@@ -17,6 +17,7 @@ from touchcell.perception.networks.contact_network import Alignment
 
 _DISPLACEMENT_PX = 8.0
 _NARROWEST = 0.02
+_MOST_FOR_DETAILS = 8000
 
 
 class DisplacementNetwork(nn.Module):
@@ -30,14 +31,19 @@ class DisplacementNetwork(nn.Module):
         model: of the displacements.
         hidden: units of each layer.
         networks: number of networks, trained side by side and independently.
+        details: (k, 2 m) 1/px, rows that map displacements to further inputs (``details_of``); None for none.
     """
 
     mean: Tensor
     scaled: Tensor
 
-    def __init__(self, model: DisplacementModel, hidden: tuple[int, ...], networks: int) -> None:
+    def __init__(
+        self, model: DisplacementModel, hidden: tuple[int, ...], networks: int, details: Array | None = None
+    ) -> None:
         super().__init__()
         features = features_of(model)
+        if details is not None:
+            features = np.concatenate([features, details.T], axis=1)
         scaled = features[:, len(model.mean) :]
         self.register_buffer("mean", torch.from_numpy(model.mean.astype(np.float32)), persistent=False)
         self.register_buffer("scaled", torch.from_numpy(scaled.astype(np.float32)), persistent=False)
@@ -86,6 +92,24 @@ def features_of(model: DisplacementModel) -> Array:
     """Return the (2 m, f) inputs of the first layers: single markers, and the modes of the displacement model."""
     scaled = model.basis.T / np.maximum(model.sd, _NARROWEST * model.sd[0])
     return np.concatenate([np.eye(len(model.mean)) / _DISPLACEMENT_PX, scaled], axis=1)
+
+
+def details_of(displacements: Array, count: int, smallest_px: float) -> Array:
+    """Return (count, 2 m) 1/px: principal components, each scaled to a standard deviation of one.
+
+    What tells an edge from one that leans moves markers by a tenth of a pixel, in components far behind those that
+    suffice to match them.
+
+    Args:
+        displacements: (n, 2 m) px of training contacts.
+        count: number of components.
+        smallest_px: components that vary by less are scaled as if they varied by this.
+    """
+    centred = displacements - displacements.mean(axis=0)
+    _, singular, basis = np.linalg.svd(centred[:_MOST_FOR_DETAILS], full_matrices=False)
+    spread = singular[:count] / math.sqrt(min(len(centred), _MOST_FOR_DETAILS))
+    rows: Array = basis[:count] / np.maximum(spread, smallest_px)[:, None]
+    return rows
 
 
 class Jitter:

@@ -42,7 +42,12 @@ from touchcell.perception.networks.checkpoint import (
 )
 from touchcell.perception.networks.contact_network import Alignment
 from touchcell.perception.networks.dataset import cache_key, default_cache, label_range
-from touchcell.perception.networks.displacement_network import DisplacementNetwork, Jitter, displacement_loss
+from touchcell.perception.networks.displacement_network import (
+    DisplacementNetwork,
+    Jitter,
+    details_of,
+    displacement_loss,
+)
 from touchcell.perception.networks.export import write_trained
 from touchcell.perception.networks.marker_learning import (
     GRID,
@@ -80,6 +85,8 @@ class MarkerSettings:
         memory: decay of the running average of the networks: the fraction that is kept per step.
         noise: standard deviation added to scaled inputs.
         shift_px, turn_rad, zoom: standard deviations of the jitter, as of a camera that was remounted.
+        details: principal components of the displacements that the networks have as inputs of their own.
+        details_px: components that vary by less are scaled as if they varied by this.
     """
 
     epochs: int = 80
@@ -97,6 +104,8 @@ class MarkerSettings:
     shift_px: float = 0.5
     turn_rad: float = 0.0022
     zoom: float = 0.00125
+    details: int = 0
+    details_px: float = 0.1
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.learning_rate) and self.learning_rate > 0.0):
@@ -413,7 +422,11 @@ class _Run:
     def __post_init__(self) -> None:
         self.model = model = self.matched.model
         settings = self.settings
-        self.network = DisplacementNetwork(model, settings.hidden, settings.networks)
+        details = None
+        if settings.details:
+            taught = self.matched.training[self.matched.taught].astype(np.float64)
+            details = details_of(taught, settings.details, settings.details_px)
+        self.network = DisplacementNetwork(model, settings.hidden, settings.networks, details)
         self.average = copy.deepcopy(self.network).eval()
         self.alignment = Alignment(self.labels)
         self.optimizer = torch.optim.AdamW(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from touchcell.geometry.gaussian import PoseGaussian
+from touchcell.perception.features.feature_model import TouchedFeature
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,6 +21,7 @@ class ContactEstimate:
         t_ns: time of the estimate: the frame's, or later where it was propagated by the sensor's motion since.
         in_range: False when the network's output is outside its training range.
         nis: normalised innovation squared of the last correction (6 degrees of freedom), None before the second frame.
+        touched: what it touches, with probabilities; None without a classifier.
         change: how much the newest image differs from the zero frame, 0 to 1, as the contact gate measures it; None
             without a gate.
         markers: fraction of the markers expected in view that were detected, for a marker estimator.
@@ -38,3 +40,4 @@ class ContactEstimate:
     measured: PoseGaussian | None = None
     refusal: str = ""
     change: float | None = None
+    touched: TouchedFeature | None = None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, ClassVar, Final, Literal, TypeAlias
+from typing import TYPE_CHECKING, Annotated, ClassVar, Final, TypeAlias
 
 from touchcell.drivers.core.protocols import FrameSource
 from touchcell.plugin_section import PluginSection, Section
@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     from touchcell.perception.runtime.pipeline import ContactSource
 
 
-Feature: TypeAlias = Literal["surface", "edge"]
-"""What a contact pose is relative to."""
+Feature: TypeAlias = str
+"""What a contact pose is relative to: the name of a ``FeatureSpec``."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -59,11 +59,13 @@ class FilterSpec:
         name: value of ``model`` in the cell file.
         summary: one line for ``touchcell list``.
         config: pydantic model of its section, which builds the filter.
+        feature: name of the feature whose motion relative to the sensor it predicts.
     """
 
     name: str
     summary: str
     config: type[FilterConfig]
+    feature: str = "surface"
 
 
 FILTERS: Final = Registry("touchcell.filters", "filter", FilterSpec)

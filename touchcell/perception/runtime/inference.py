@@ -113,7 +113,7 @@ class ContactModel:
         """Estimate the contact in an image returned by ``reduce``.
 
         A gate and a prediction can share the preprocessing. An image that is not of the model's own sensor and camera,
-        as far as its file can tell, is not ``in_range``, whatever the network's output.
+        as far as its file shows, is not ``in_range``, whatever the network's output.
         """
         return self._judged(self.infer(reduced), reduced)
 

@@ -9,12 +9,15 @@ from pydantic import NonNegativeInt, PositiveFloat, model_validator
 
 from touchcell.errors import ConfigError
 from touchcell.input_file import BUILTIN, InputFile, files_in
-from touchcell.paths import MODELS
+from touchcell.paths import CLASSIFIERS, MODELS
 from touchcell.perception.runtime.estimator_spec import EstimatorConfig, EstimatorContext, EstimatorSpec, Feature
+from touchcell.perception.runtime.feature_spec import EDGE
 from touchcell.perception.runtime.filter_spec import FilterSection
 from touchcell.plugin_section import Section
 
 if TYPE_CHECKING:
+    from touchcell.perception.features.feature_model import FeatureModel
+    from touchcell.perception.models.model_file import Model
     from touchcell.perception.runtime.pipeline import ContactPipeline
 
 _MODEL: Final = InputFile(
@@ -22,6 +25,12 @@ _MODEL: Final = InputFile(
     files_in(MODELS, ".safetensors"),
     BUILTIN,
     hint="`touchcell train --data DIR --out NAME.safetensors` writes one, --model names another",
+)
+_FEATURES: Final = InputFile(
+    "a classifier's file",
+    files_in(CLASSIFIERS, ".safetensors"),
+    BUILTIN,
+    hint="`touchcell train-sim --feature kinds --out NAME.safetensors` writes one",
 )
 _CALIBRATION: Final = InputFile("a calibration file", hint="`touchcell calibrate` writes one")
 
@@ -59,6 +68,8 @@ class NetworkEstimator(EstimatorConfig):
         gate: decides about contact without the network; without it every frame goes through the network.
         zero_frame: ``compare`` the first frame of a run, out of contact, with the model's own, where there is a gate:
             a small change of the camera is undone, a large one refused; or ``skip`` that.
+        features: file of a classifier of what is touched (``touchcell train-sim --feature kinds``), or
+            ``builtin:NAME``; it reads the markers of a marker model.
         filter: fuses the estimates over time; without it each frame stands by itself.
     """
 
@@ -70,6 +81,7 @@ class NetworkEstimator(EstimatorConfig):
     gate: GateConfig | None = None
     zero_frame: Literal["compare", "skip"] = "compare"
     filter: FilterSection | None = None
+    features: Annotated[str | None, _FEATURES] = None
 
     def build(self, context: EstimatorContext) -> ContactPipeline:
         """Return the pipeline.
@@ -109,7 +121,35 @@ class NetworkEstimator(EstimatorConfig):
             if self.zero_frame == "compare":
                 zero = ZeroFrame(context.sensor, stored, known, enter=enter, leave=leave)
         pose_filter = None if self.filter is None else self.filter.build()
-        return ContactPipeline(context.camera, model, contact_gate=contact_gate, pose_filter=pose_filter, zero=zero)
+        return ContactPipeline(
+            context.camera,
+            model,
+            contact_gate=contact_gate,
+            pose_filter=pose_filter,
+            zero=zero,
+            features=self._classifier(context.sensor, stored),
+        )
+
+    def _classifier(self, sensor: str, model: Model) -> FeatureModel | None:
+        """Return the classifier. Raises ModelError, and ConfigError where the model has no or other markers."""
+        from touchcell.perception.features.feature_model import load_feature_model
+        from touchcell.perception.models.marker_architecture import MarkerArchitecture
+
+        if self.features is None:
+            return None
+        name = self.features
+        classifier = load_feature_model(
+            CLASSIFIERS / f"{name.removeprefix(BUILTIN)}.safetensors" if name.startswith(BUILTIN) else Path(name)
+        )
+        architecture = model.header.architecture
+        if not isinstance(architecture, MarkerArchitecture) or architecture.markers != classifier.markers:
+            raise ConfigError(
+                f"it reads {classifier.markers} markers, which model {self.model} does not find",
+                key=f"sensors.{sensor}.estimator.features",
+                value=name,
+                hint="use a marker model of the same sensor, or leave out `features:`",
+            )
+        return classifier
 
 
 class EdgeNetworkEstimator(NetworkEstimator):
@@ -118,7 +158,7 @@ class EdgeNetworkEstimator(NetworkEstimator):
     A filter that holds the contact still does not suit it: the edge frame glides along the edge with the sensor.
     """
 
-    feature: ClassVar[Feature] = "edge"
+    feature: ClassVar[Feature] = EDGE.name
 
     kind: Literal["edge_network"]  # type: ignore[assignment]
 

@@ -20,6 +20,7 @@ from touchcell.drivers.core.samples import Frame, Stamped
 from touchcell.geometry import gaussian
 from touchcell.geometry.gaussian import PoseGaussian
 from touchcell.geometry.types import Array, ImageArray
+from touchcell.perception.features.feature_model import NOTHING, FeatureModel
 from touchcell.perception.models.prediction import ContactEstimator
 from touchcell.perception.models.preprocessing import Preprocessing
 from touchcell.perception.runtime.contact_gate import ContactGate
@@ -92,6 +93,7 @@ class ContactPipeline:
         contact_gate: detects contact without the network; None passes every frame through the network.
         pose_filter: None treats each frame independently.
         zero: compares the first frame with the model's own image out of contact; None accepts any.
+        features: tells what is touched from the markers that the estimator found; None tells nothing.
         timer: nanosecond counter for stage durations; it never influences an estimate.
     """
 
@@ -103,6 +105,7 @@ class ContactPipeline:
         contact_gate: ContactGate | None = None,
         pose_filter: ContactFilter | None = None,
         zero: ZeroFrame | None = None,
+        features: FeatureModel | None = None,
         timer: Timer = time.perf_counter_ns,
     ) -> None:
         self._camera = camera
@@ -110,6 +113,7 @@ class ContactPipeline:
         self._contact_gate = contact_gate
         self._filter = pose_filter
         self._zero = zero
+        self._features = features
         self._timer = timer
         self._poses = PoseHistory()
         self._newest: ContactEstimate | None = None
@@ -195,9 +199,13 @@ class ContactPipeline:
             if self._filter is not None:
                 self._filter.reset()
                 self._filtering = False
-            return ContactEstimate(False, None, frame.t_ns, frame.seq, frame.t_ns, change=change)
+            touched = None if self._features is None else NOTHING
+            return ContactEstimate(False, None, frame.t_ns, frame.seq, frame.t_ns, change=change, touched=touched)
         start = self._timer()
         prediction = self._model.predict_reduced(reduced)
+        touched = None
+        if self._features is not None and prediction.displacements is not None:
+            touched = self._features.touched(prediction.displacements)
         infer_ns = self._timer() - start
         start = self._timer()
         observed = gaussian.from_exponential(prediction.xi, prediction.covariance)
@@ -224,6 +232,7 @@ class ContactPipeline:
             measured=observed,
             refusal=prediction.refusal,
             change=change,
+            touched=touched,
         )
 
     def _replayed(self, estimate: ContactEstimate, now_ns: int) -> ContactEstimate:

@@ -12,8 +12,8 @@ nothing, and a new contact begins stuck. What the shares leave out is noise of t
 the innovations too (covariance matching: Mehra, IEEE TAC 1972; Myers & Tapley, IEEE TAC 1976). A surface that moves by
 itself is followed by that.
 
-Frames of one network err alike from frame to frame. That part of their variance, ``bias_share``, is not averaged out:
-it is left out of the correction and added to what the filter reports (a consider state: Schmidt 1966).
+The errors of one network are correlated from frame to frame. That part of their variance, ``bias_share``, is not
+averaged out: it is left out of the correction and added to what the filter reports (a consider state: Schmidt 1966).
 """
 
 from __future__ import annotations
@@ -113,7 +113,7 @@ class StickSlipFilter:
         return gaussian.compound(se3.exp(self._shares * motion), own, noise=noise), motion
 
     def _learnt(self, prior: PoseGaussian, white: PoseGaussian, e: Array, motion: Array, dt_s: float) -> PoseGaussian:
-        """Learn shares and process noise from an innovation; return the prior with what it tells of its own frame."""
+        """Learn shares and process noise from an innovation; return the prior updated by its own frame."""
         variance = np.diagonal(prior.covariance) + np.diagonal(white.covariance)
         change = _LEARNING * e * motion / (motion**2 + variance)
         shares = np.clip(self._shares + change, 0.0, 1.0)
@@ -138,7 +138,7 @@ class StickSlipConfig(FilterConfig):
     Attributes:
         drift_mm_per_sqrt_s: least growth of the position's standard deviation between frames.
         drift_deg_per_sqrt_s: least growth of the orientation's standard deviation between frames.
-        bias_share: part of a frame's variance that is alike from frame to frame, so that it does not average out.
+        bias_share: part of a frame's variance that is the same from frame to frame, so that it does not average out.
     """
 
     model: Literal["stick_slip"]

@@ -6,7 +6,7 @@ import zlib
 from typing import ClassVar, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, NonNegativeInt
 
 from touchcell.drivers.core.protocols import FrameSource
 from touchcell.drivers.core.samples import Frame, Stamped
@@ -83,7 +83,7 @@ class TrueEdge(EstimatorConfig):
     kind: Literal["true_edge"]
     noise_mm: float = Field(default=0.0, ge=0.0, le=5.0)
     noise_deg: float = Field(default=0.0, ge=0.0, le=20.0)
-    seed: int = 0
+    seed: NonNegativeInt = 0
 
     def build(self, context: EstimatorContext) -> NoisyEdgeSource:
         """Return the source. Raises ConfigError where the edge is not known."""

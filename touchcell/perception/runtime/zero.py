@@ -25,7 +25,7 @@ _QUIET = 0.5
 
 @dataclass(frozen=True)
 class Zeroed:
-    """An estimator and a contact gate for the camera that is there.
+    """An estimator and a contact gate for the camera as mounted.
 
     Attributes:
         estimator: for this camera.

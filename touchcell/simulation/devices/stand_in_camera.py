@@ -15,6 +15,7 @@ from touchcell.errors import ConfigError
 from touchcell.geometry.types import Array
 from touchcell.simulation.devices import tactip
 from touchcell.simulation.devices.tactip import SimTactip, SimTactipConfig
+from touchcell.simulation.scene import Scene
 
 
 class StandInCamera(SimTactip):
@@ -60,6 +61,7 @@ def stand_in(spec: AnyDriver, placement: Placement) -> AnyDriver:
             tcp_to_sensor_mm_deg=placement.tcp_to_sensor_mm_deg,
             rate_hz=behaviour.rate_hz,
             latency_ms=1e3 * behaviour.latency_s,
+            feels="shape" if isinstance(context.scene, Scene) and context.scene.feels_shape else "plane",
         )
         if placement.mounted_on is None:
             context = replace(context, devices={"": _Still()})  # type: ignore[dict-item]

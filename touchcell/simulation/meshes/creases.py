@@ -115,7 +115,7 @@ def creases(smooth: SmoothMesh) -> Polylines:
 
 
 def _tangents(begin: Indices, finish: Indices, unit: Array, vertex_count: int) -> Array:
-    """Return (k, 2, 3) the tangent at both ends of each piece: the mean of both pieces where exactly two go on."""
+    """Return (k, 2, 3) the tangent at both ends of each piece: the mean of both pieces where exactly two continue."""
     at_vertex: list[list[int]] = [[] for _ in range(vertex_count)]
     for i, (a, b) in enumerate(zip(begin.tolist(), finish.tolist(), strict=True)):
         at_vertex[a].append(i)

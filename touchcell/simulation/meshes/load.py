@@ -26,6 +26,9 @@ LARGEST_HOLE: Final = 12
 """Edges around a hole that a repair closes."""
 MOST_OPEN: Final = 0.1
 """Share of its own area that a piece of a mesh may lack to be closed; with larger openings it is a sheet."""
+SHEET_M: Final = 0.2e-3
+"""Thickness of a sheet with two sides."""
+_MOSTLY: Final = 0.9
 INSTALL: Final = "pip install 'touchcell[mesh]'"
 
 
@@ -44,7 +47,8 @@ def load_mesh(path: Path, unit: Unit, *, scale: float = 1.0, repair: bool) -> Tr
 
     Vertices that coincide are merged and faces without an area dropped, always. A mesh that does not enclose a volume
     is refused unless ``repair`` asks for small holes to be closed and faces to be oriented; what stays open is a sheet,
-    whose outside is where the normals of its faces point.
+    whose outside is where the normals of its faces point. Where a file has each face twice, once for either side, as
+    models for drawing do, its sheets become walls of 0.2 mm that can be touched from both sides.
 
     Args:
         path: the file.
@@ -82,9 +86,11 @@ def load_mesh(path: Path, unit: Unit, *, scale: float = 1.0, repair: bool) -> Tr
     _require_likely_size(path, scale * np.asarray(loaded.vertices), unit)
     loaded.apply_scale(scale)
     loaded.merge_vertices(merge_tex=True, merge_norm=True)
-    mesh = _without_empty_faces(_triangles(loaded, unit))
+    read = _triangles(loaded, unit)
+    mesh = _without_empty_faces(read)
     if repair:
-        return _repaired(mesh)
+        repaired = _repaired(mesh)
+        return with_thickness(repaired, SHEET_M) if _two_sided(read) else repaired
     if problem := what_is_open(mesh):
         raise ConfigError(
             f"does not enclose a volume: {problem}",
@@ -117,7 +123,7 @@ def volume_m3(mesh: TriangleMesh) -> float:
 
 
 def _require_whole_stl(path: Path) -> None:
-    """Refuse an STL file that ends before its last triangle: libraries read what is there, or nothing."""
+    """Refuse an STL file that ends before its last triangle: libraries read the rest, or nothing."""
     with path.open("rb") as file:
         head = file.read(1024)
         size = file.seek(0, os.SEEK_END)
@@ -179,7 +185,51 @@ def _repaired(mesh: TriangleMesh) -> TriangleMesh:
 
     made = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     trimesh.repair.fix_winding(made)
-    return _with_outside_out(_with_holes_closed(_without_empty_faces(_triangles(made, "m"))))
+    oriented = _as_most_were(mesh, _triangles(made, "m"))
+    return _with_outside_out(_with_holes_closed(_without_empty_faces(oriented)))
+
+
+def _as_most_were(before: TriangleMesh, after: TriangleMesh) -> TriangleMesh:
+    """Turn round each piece of ``after`` most of whose area was the other way round ``before``; their order is one."""
+    piece, faces = _pieces(Edges.of(after.faces)), after.faces.copy()
+    kept = np.einsum("mc,mc->m", before.face_normals(), after.face_normals())
+    area = np.sign(kept) * np.sqrt(np.abs(kept))
+    turned = np.bincount(piece, weights=area)[piece] < 0.0
+    faces[turned] = faces[turned][:, ::-1]
+    return TriangleMesh(after.vertices, np.ascontiguousarray(faces))
+
+
+def _two_sided(mesh: TriangleMesh) -> bool:
+    """Return True if nearly every face is there twice, once the other way round."""
+    a, b, c = mesh.faces.astype(np.int64).T
+    count = len(mesh.vertices)
+    low = np.minimum(np.minimum(a, b), c)
+    # Beginning at its lowest corner, a face and its other side differ in the order of the other two.
+    second = np.where(low == a, b, np.where(low == b, c, a))
+    third = a + b + c - low - second
+    one, other = (low * count + second) * count + third, (low * count + third) * count + second
+    return bool(np.isin(one, other).mean() >= _MOSTLY)
+
+
+def with_thickness(mesh: TriangleMesh, thickness_m: float) -> TriangleMesh:
+    """Return a mesh whose open pieces are walls: two sides, half of ``thickness_m`` away from the sheet, and a rim."""
+    edges = Edges.of(mesh.faces)
+    piece, open_edge = _pieces(edges), edges.other < 0
+    sheets = np.isin(piece, np.unique(piece[open_edge.any(axis=1)]))
+    sheet, count = mesh.faces[sheets], len(mesh.vertices)
+    normals = np.zeros_like(mesh.vertices)
+    doubled = mesh.face_normals()[sheets]
+    for i in range(3):
+        np.add.at(normals, sheet[:, i], doubled)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+    face, edge = np.nonzero(open_edge & sheets[:, None])
+    a, b = mesh.faces[face, edge], mesh.faces[face, (edge + 1) % 3]
+    rim = [np.stack([b, a, a + count], 1), np.stack([b, a + count, b + count], 1)]
+    half = 0.5 * thickness_m * normals
+    return TriangleMesh(
+        np.concatenate([mesh.vertices + half, mesh.vertices - half]),
+        np.ascontiguousarray(np.concatenate([mesh.faces, sheet[:, ::-1] + count, *rim]), dtype=np.int32),
+    )
 
 
 def _with_outside_out(mesh: TriangleMesh) -> TriangleMesh:

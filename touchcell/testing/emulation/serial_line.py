@@ -27,7 +27,7 @@ class SerialLine(Protocol):
 
     @property
     def plugged(self) -> bool:
-        """True while the adapter is there."""
+        """True while the adapter is plugged in."""
         ...
 
     def plug_in(self, on_bytes: Callable[[bytes], None]) -> None:

@@ -1,7 +1,7 @@
 """Joint angles that an emulated arm publishes in shared memory, for the scene around it.
 
 The scene reads where each arm is several hundred times a second. Asking over the control channel made it wait for the
-arm's own process each time, and a scene that waits draws no frames; reading shared memory waits for nobody.
+arm's own process each time, and a scene that waits draws no frames; reading shared memory never waits.
 """
 
 from __future__ import annotations

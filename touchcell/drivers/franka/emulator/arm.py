@@ -1,7 +1,9 @@
 """Model of a Franka arm: kinematics, limits, reflexes. No I/O and no clock: it moves when it is stepped.
 
 Denavit-Hartenberg table, joint and Cartesian limits of the FR3 from Franka's "Robot and interface specifications".
-There are no dynamics: the arm follows commands exactly, and a reflex stops it at once where a real arm brakes.
+Motion generators have no dynamics: the arm follows them exactly, and a reflex stops it at once where a real arm brakes.
+Commanded torques move joints of constant, uncoupled inertia with friction, gravity compensated as Franka's controller
+does; that judges protocol and signs, not a control law.
 """
 
 from __future__ import annotations
@@ -32,6 +34,12 @@ ROT_SPEED_RAD_S, ROT_ACCEL_RAD_S2, ROT_JERK_RAD_S3 = 2.5, 17.0, 8500.0
 # Position-based joint velocity limits of the FR3's URDF: (velocity offset rad/s, deceleration limit rad/s²).
 _VELOCITY_OFFSET_RAD_S = (0.3, 0.2, 0.2, 0.3, 0.35, 0.35, 0.35)
 _DECELERATION_RAD_S2 = (6.0, 2.585, 3.5, 4.0, 17.0, 5.5, 17.0)
+
+TORQUE_N_M = np.array([87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0])
+TORQUE_RATE_N_M_S = 1000.0
+# Of this emulator, in the order of size of an arm of 18 kg.
+_INERTIA_KG_M2 = np.array([1.2, 1.2, 0.9, 0.9, 0.15, 0.15, 0.08])
+_FRICTION_N_M_S = np.array([6.0, 6.0, 4.0, 4.0, 1.0, 1.0, 0.5])
 
 READY_POSE_RAD = np.array([0.0, -math.pi / 4, 0.0, -3 * math.pi / 4, 0.0, math.pi / 2, math.pi / 4])
 _SMALLEST_SINGULAR_VALUE = 0.02
@@ -124,6 +132,7 @@ class EmulatedArm:
         wrench: (6,) external wrench on the end effector, along base axes.
         force_threshold: (6,) above which a Cartesian reflex stops the arm.
         contact_threshold: (6,) above which contact is reported.
+        tau: (7,) N m commanded torques, beyond gravity.
     """
 
     q: Array = field(default_factory=READY_POSE_RAD.copy)
@@ -137,7 +146,10 @@ class EmulatedArm:
     T_base_ee: Array = field(init=False)
     J: Array = field(init=False)
     twist_c: Array = field(default_factory=lambda: np.zeros(6))
+    tau: Array = field(default_factory=lambda: np.zeros(7))
     _generator: Generator = Generator.IDLE
+    _by_torque: bool = False
+    _torque_id: int = 0
     _profile: _Profile | None = None
     _began_id: int = 0
     _T_commanded: Array = field(default_factory=lambda: np.eye(4))
@@ -151,13 +163,17 @@ class EmulatedArm:
         self.T_base_ee = T_base_flange @ self.F_T_NE @ self.NE_T_EE
         self.J = np.vstack([np.cross(axes, self.T_base_ee[:3, 3:] - origins, axis=0), axes])
 
-    def begin(self, generator: Generator, message_id: int = 0) -> bool:
-        """Start a motion generator at state ``message_id``; False if the pose is too singular for a Cartesian one."""
+    def begin(self, generator: Generator, message_id: int = 0, *, by_torque: bool = False) -> bool:
+        """Start a motion generator at state ``message_id``; False if the pose is too singular for a Cartesian one.
+
+        With ``by_torque`` the client closes the loop: its torques move the arm, and its motion is a wish only.
+        """
         if generator in (Generator.CARTESIAN_POSITION, Generator.CARTESIAN_VELOCITY):
             smallest = np.linalg.svd(self.J, compute_uv=False)[-1]
             if smallest < _SMALLEST_SINGULAR_VALUE:
                 return False
         self._generator = generator
+        self._by_torque, self._torque_id = by_torque, message_id
         self._profile = None
         self._began_id = message_id
         self.halt()
@@ -167,21 +183,40 @@ class EmulatedArm:
         """Set all velocities to zero."""
         self.dq = np.zeros(7)
         self.twist_c = np.zeros(6)
+        self.tau = np.zeros(7)
 
     def step(self, command: MotionCommand | None, dt_s: float) -> None:
         """Move for ``dt_s`` by the newest command; without one the velocity continues. Raises Reflex."""
-        if self._generator in (Generator.IDLE, Generator.NONE):
+        if self._generator is Generator.IDLE or (self._generator is Generator.NONE and not self._by_torque):
             return
-        if command is not None:
+        if self._by_torque:
+            self._accelerate(command, dt_s)
+        elif command is not None:
             self._follow(command)
-        if self._generator is Generator.CARTESIAN_VELOCITY:
+        if self._generator is Generator.CARTESIAN_VELOCITY and not self._by_torque:
             self.dq = self._inverse(self.twist_c)
-        if self._generator in (Generator.CARTESIAN_VELOCITY, Generator.JOINT_VELOCITY):
+        if self._by_torque or self._generator in (Generator.CARTESIAN_VELOCITY, Generator.JOINT_VELOCITY):
             self.q = self.q + self.dq * dt_s
         self._check_joints()
         self.refresh()
         if (np.abs(self.wrench) > self.force_threshold).any():
             raise Reflex("cartesian_reflex")
+
+    def _accelerate(self, command: MotionCommand | None, dt_s: float) -> None:
+        """Accelerate by the newest torques, which stay until others come. Raises Reflex."""
+        if command is not None:
+            tau = np.array(command.tau)
+            _check_finite(tau)
+            if (np.abs(tau) > TORQUE_N_M).any():
+                raise Reflex("tau_j_range_violation", f"{tau} N m")
+            gap_s = max(command.message_id - self._torque_id, 1) * _TICK_S
+            step = float(np.abs(tau - self.tau).max())
+            # Values pass through doubles and a rate limiter that is exact to rounding.
+            if step > TORQUE_RATE_N_M_S * gap_s * (1.0 + 1e-6):
+                raise Reflex("controller_torque_discontinuity", f"{step:g} N m within {gap_s:g} s")
+            self.tau, self._torque_id = tau, command.message_id
+        external = self.J.T @ self.wrench
+        self.dq = self.dq + dt_s * (self.tau + external - _FRICTION_N_M_S * self.dq) / _INERTIA_KG_M2
 
     def _follow(self, command: MotionCommand) -> None:
         if self._generator is Generator.CARTESIAN_VELOCITY:
@@ -256,6 +291,13 @@ class EmulatedArm:
         return velocity
 
     def _check_joints(self) -> None:
+        if self._by_torque:
+            if (self.q < JOINT_MIN_RAD).any() or (self.q > JOINT_MAX_RAD).any():
+                self.q = np.clip(self.q, JOINT_MIN_RAD, JOINT_MAX_RAD)
+                raise Reflex("joint_position_limits_violation")
+            if (np.abs(self.dq) > JOINT_SPEED_RAD_S).any():
+                raise Reflex("joint_velocity_violation")
+            return
         prefix = "joint" if self._generator in (Generator.JOINT_POSITION, Generator.JOINT_VELOCITY) else "cartesian"
         infix = "" if prefix == "joint" else "joint_"
         if (self.q < JOINT_MIN_RAD).any() or (self.q > JOINT_MAX_RAD).any():

@@ -2,7 +2,8 @@
 
 Faithful in what libfranka checks: handshake, model, motions and their outcomes, modes, reflexes, recovery, lost
 packets.
-Not emulated: dynamics, contact, the braking of a reflex (it stops at once), Desk, the gripper. While this process
+The hand is on TCP 1338. Not emulated: dynamics of motion generators, contact, the braking of a reflex (it stops at
+once), Desk. While this process
 oversleeps its clock stands still, and runs a third faster afterwards: a busy machine slows the robot down for a moment
 but does not make it jump.
 """
@@ -44,6 +45,7 @@ from touchcell.drivers.franka.emulator.codec import (
     encode_reply,
     split_requests,
 )
+from touchcell.drivers.franka.emulator.gripper import EmulatedHand
 from touchcell.drivers.franka.errors import BY_NAME, ERRORS
 from touchcell.errors import ConfigError
 from touchcell.testing.emulation.base import CommandOnset, Emulator
@@ -84,6 +86,8 @@ class FrankaEmulator(Emulator):
         "other_client": "another client is connected",
         "slow_recovery": "error recovery takes VALUE seconds",
         "guiding": "the arm is guided by hand",
+        "object": "an object of this width, m, is between the fingers of the hand",
+        "no_hand": "the hand is not connected: its port refuses",
         "restart": "drop the client and return after a fifth of a second with the clock at zero",
     }
 
@@ -91,6 +95,7 @@ class FrankaEmulator(Emulator):
         super().__init__()
         self._host = host
         self._arm = EmulatedArm() if start_deg is None else EmulatedArm(q=np.radians(start_deg))
+        self._hand = EmulatedHand(host)
         self._state = RobotState(message_id=1000)
         self._counts = dict.fromkeys(
             ("requests", "energising", "commands", "states", "bad_messages", "late", "reflexes"), 0
@@ -119,6 +124,7 @@ class FrankaEmulator(Emulator):
         self._udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._udp.bind((self._host, 0))
         self._udp.setblocking(False)
+        await self._hand.start()
         self._describe_tool()
         self.publish_joints(self._arm.q)
         self._ticker = Ticker(_PERIOD_NS, self._tick, waits=self._patience_s > 0.0)
@@ -128,6 +134,7 @@ class FrankaEmulator(Emulator):
             self._ticker.close()
         self._drop_client()
         self._stop_listening()
+        self._hand.stop()
         if self._udp is not None:
             self._udp.close()
 
@@ -154,6 +161,8 @@ class FrankaEmulator(Emulator):
             "command_onset_ns": self._onset.t_ns,
             "last_command_ms": self._last_command_ms,
             "at_last_command_m": self._at_last_command,
+            "hand_width_m": self._hand.width_m,
+            "hand_is_grasped": self._hand.is_grasped,
             "force_threshold": arm.force_threshold.tolist(),
             "received": self._received,
             "active": self.active,
@@ -183,6 +192,10 @@ class FrankaEmulator(Emulator):
             self._stop_listening()
         elif fault == "external_wrench":
             self._arm.wrench = np.array(value, dtype=np.float64)
+        elif fault == "object":
+            self._hand.object_m = float(value)
+        elif fault == "no_hand":
+            self._hand.stop()
         elif fault == "restart":
             del self.active["restart"]
             self._restart()
@@ -194,6 +207,10 @@ class FrankaEmulator(Emulator):
             self._listen()
         elif fault == "external_wrench":
             self._arm.wrench = np.zeros(6)
+        elif fault == "object":
+            self._hand.object_m = None
+        elif fault == "no_hand":
+            asyncio.get_running_loop().create_task(self._hand.start())
 
     def _listen(self) -> None:
         listener = socket.socket()
@@ -246,6 +263,8 @@ class FrankaEmulator(Emulator):
         self._state.message_id += 1
         if "unplug" not in self.active:
             self._read_requests()
+        self._hand.forgets = "unplug" in self.active
+        self._hand.step(_PERIOD_NS * 1e-9)
         self._await_answer()
         command = self._read_command()
         if self._move_id is not None:
@@ -353,7 +372,9 @@ class FrankaEmulator(Emulator):
             status = MoveStatus.REJECTED_BY_SAFETY
         elif self._state.mode is not Mode.IDLE:
             status = MoveStatus.NOT_POSSIBLE
-        elif not self._arm.begin(generator, self._state.message_id):
+        elif generator is Generator.NONE and controller is not Controller.EXTERNAL:
+            status = MoveStatus.INVALID_ARGUMENT
+        elif not self._arm.begin(generator, self._state.message_id, by_torque=controller is Controller.EXTERNAL):
             status = MoveStatus.SINGULAR_START
         else:
             status = MoveStatus.MOTION_STARTED
@@ -485,6 +506,7 @@ class FrankaEmulator(Emulator):
             state[name] = arm.q
         for name in ("dq", "dq_d", "dtheta"):
             state[name] = arm.dq
+        state["tau_J"] = state["tau_J_d"] = arm.tau
         state["O_dP_EE_c"] = state["O_dP_EE_d"] = arm.twist_c
         for name in ("elbow", "elbow_d", "elbow_c"):
             state[name] = (arm.q[2], -1.0 if arm.q[3] < 0 else 1.0)

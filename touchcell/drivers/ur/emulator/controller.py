@@ -1,4 +1,4 @@
-"""Model of a UR controller: power, safety, program, registers and arm, stepped every 2 ms."""
+"""Model of a UR controller: power, safety, program, registers and arm, stepped once in its control period."""
 
 from __future__ import annotations
 
@@ -10,8 +10,12 @@ import numpy as np
 
 from touchcell.drivers.ur.codec import Value
 from touchcell.drivers.ur.emulator import kinematics as ur_model
+from touchcell.drivers.ur.emulator.compliance import Compliance
+from touchcell.drivers.ur.emulator.host import ProgramError
 from touchcell.drivers.ur.emulator.motion import ArmState, Brake, Motion
-from touchcell.drivers.ur.emulator.program import NAMES, PERIOD_S, ControlProgram, ProgramError
+from touchcell.drivers.ur.emulator.program import NAMES, ControlProgram, injected_path
+from touchcell.drivers.ur.emulator.script import ScriptError, Statement, parse_lines, parse_program
+from touchcell.drivers.ur.emulator.statements import ScriptProgram
 from touchcell.drivers.ur.modes import RobotMode, RuntimeState, SafetyBits, SafetyMode
 from touchcell.geometry.types import Array
 from touchcell.testing.emulation.base import CommandOnset
@@ -22,6 +26,9 @@ _SAFETY_DECEL_RAD_S2 = 12.0
 _JOINT_SPEED_LIMIT_RAD_S = math.radians(191.0)
 _START_S = 0.02
 _POWER_S = 0.05
+_HISTORY = 500
+# Of this emulator: the force from which the tool has contact is not published.
+_CONTACT_N = 5.0
 
 _BITS = {
     SafetyMode.NORMAL: SafetyBits.NORMAL_MODE,
@@ -44,10 +51,18 @@ class Controller:
         unlock_after_s: time after a protective stop before it can be unlocked (5 s on the real controller).
         q: (6,) rad joint angles at which it begins.
         model: lengths of the arm.
+        period_s: control period.
     """
 
-    def __init__(self, unlock_after_s: float = 5.0, q: Array = HOME_Q, model: ur_model.Model = ur_model.UR5E) -> None:
+    def __init__(
+        self,
+        unlock_after_s: float = 5.0,
+        q: Array = HOME_Q,
+        model: ur_model.Model = ur_model.UR5E,
+        period_s: float = 0.002,
+    ) -> None:
         self._unlock_after_s = unlock_after_s
+        self.period_s = period_s
         self.energising = 0
         self.commands: Counter[str] = Counter()
         self.onset = CommandOnset()
@@ -56,6 +71,10 @@ class Controller:
         self.remote_control = True
         self.speed_slider = 1.0
         self.wrench = np.zeros(6)
+        self._zero_wrench = np.zeros(6)
+        self._takes_external_wrench = False
+        self.payload_kg = 0.0
+        self.payload_centre_m = np.zeros(3)
         self.temperature_c = 31.0
         self.voltage_v = 48.0
         self.digital_outputs = 0
@@ -70,10 +89,13 @@ class Controller:
         self.runtime_state = RuntimeState.STOPPED
         self.outputs: dict[str, Value] = {}
         self.motion: Motion | None = None
+        self.compliance: Compliance | None = None
+        self._history = deque([self.arm.q], _HISTORY)
+        self._contact_periods = 0
         self.watchdog_hz = 0.0
-        self._program: ControlProgram | None = None
+        self._program: ControlProgram | ScriptProgram | None = None
         self._foreign_program = False
-        self._starting: tuple[float, int] | None = None
+        self._starting: tuple[float, ControlProgram | ScriptProgram] | None = None
         self._powering: tuple[float, RobotMode] | None = None
         self._input_s = 0.0
         self._input_travel_m = 0.0
@@ -96,24 +118,37 @@ class Controller:
 
     def step(self) -> None:
         """Advance by one control period."""
-        self.t_s += PERIOD_S
+        self.t_s += self.period_s
         if self._powering is not None and self.t_s >= self._powering[0]:
             self.robot_mode = self._powering[1]
             self._powering = None
         if self._starting is not None and self.t_s >= self._starting[0]:
-            self._program = ControlProgram(self, self._starting[1])
+            self._program = self._starting[1]
             self._starting = None
             self.runtime_state = RuntimeState.PLAYING
         self._watch()
         self._run_program()
-        if self.motion is not None and self.energised:
-            self.arm.move_to(self.motion.advance(self.arm, PERIOD_S, self.speed_slider), PERIOD_S)
+        self._note()
+        if (self.motion is not None or self.compliance is not None) and self.energised:
+            q = self.arm.q
+            if self.motion is not None:
+                q = self.motion.advance(self.arm, self.period_s, self.speed_slider)
+            if self.compliance is not None:
+                giving = self.compliance.twist(self.felt_wrench())
+                q = q + ur_model.joint_speeds(self.arm.J, giving) * self.period_s
+            self.arm.move_to(q, self.period_s)
             if float(np.abs(self.arm.qd).max()) > _JOINT_SPEED_LIMIT_RAD_S:
                 self.protective_stop()
-            elif self.motion.done:
+            elif self.motion is not None and self.motion.done:
                 self.motion = None
         elif self.arm.qd.any():
-            self.arm.move_to(self.arm.q, PERIOD_S)
+            self.arm.move_to(self.arm.q, self.period_s)
+
+    def _note(self) -> None:
+        """Remember where the arm was, and for how long its tool has had contact."""
+        self._history.appendleft(self.arm.q)
+        in_contact = float(np.linalg.norm(self.felt_wrench()[:3])) > _CONTACT_N
+        self._contact_periods = min(self._contact_periods + 1, _HISTORY - 1) if in_contact else 0
 
     def _watch(self) -> None:
         late = self.watchdog_hz > 0.0 and self.last_input_age_s > 1.0 / self.watchdog_hz
@@ -156,21 +191,38 @@ class Controller:
         for group, first in (("standard", 0), ("configurable", 8), ("tool", 16)):
             mask, levels = values.get(f"{group}_digital_output_mask"), values.get(f"{group}_digital_output")
             if isinstance(mask, int) and isinstance(levels, int):
-                changed = mask << first
-                self.digital_outputs = self.digital_outputs & ~changed | (levels << first) & changed
+                self.set_outputs(mask << first, levels << first)
+
+    def set_outputs(self, mask: int, levels: int) -> None:
+        """Switch the digital outputs in ``mask`` (bits of ``actual_digital_output_bits``)."""
+        self.digital_outputs = self.digital_outputs & ~mask | levels & mask
 
     def start_program(self, text: str) -> None:
-        """Run an uploaded script if it is ur-rtde's and the arm is powered, safe, and in remote control."""
+        """Run an uploaded script if the arm is powered, safe, and in remote control, and the script is understood.
+
+        Understood are the control program of ur-rtde and straight-line programs.
+        """
         if not (self.remote_control and self.energised and self.safety_mode in (SafetyMode.NORMAL, SafetyMode.REDUCED)):
             self.log("script rejected: not in remote control, not powered or not safe")
-        elif not re.match(r"\s*def rtde_control\(\):", text) or "rtde_set_watchdog" not in text or "$" in text:
-            self.log("script rejected: not the control script of ur-rtde, or not made for this version")
-        else:
-            self.energising += 1
-            self.commands["script"] += 1
-            self.stop_program()
-            offset = re.search(r"reg_offset_int = *#[^\n]*\n\s*(\d+)", text)
-            self._starting = (self.t_s + _START_S, int(offset[1]) if offset else 0)
+            return
+        try:
+            program = self._control_program(text) if self._is_ours(text) else ScriptProgram(self, parse_program(text))
+        except ScriptError as error:
+            self.log(f"script rejected: {error}")
+            return
+        self.energising += 1
+        self.commands["script"] += 1
+        self.stop_program()
+        self._starting = (self.t_s + _START_S, program)
+
+    @staticmethod
+    def _is_ours(text: str) -> bool:
+        return bool(re.match(r"\s*def rtde_control\(\):", text)) and "rtde_set_watchdog" in text and "$" not in text
+
+    def _control_program(self, text: str) -> ControlProgram:
+        offset = re.search(r"reg_offset_int = *#[^\n]*\n\s*(\d+)", text)
+        path: tuple[Statement, ...] = tuple(parse_lines(list(injected_path(text))))
+        return ControlProgram(self, int(offset[1]) if offset else 0, path)
 
     def play_foreign_program(self) -> None:
         """Start a program that is not ours."""
@@ -182,6 +234,7 @@ class Controller:
         self._program = None
         self._starting = None
         self._foreign_program = False
+        self.compliance = None
         self.watchdog_hz = 0.0
         self.runtime_state = RuntimeState.STOPPED
         if self.motion is not None:
@@ -217,6 +270,7 @@ class Controller:
                 # A button that is released before the power is cut does not keep it.
                 self.robot_mode, self._powering = RobotMode.POWER_OFF, None
             return
+        self.compliance = None
         if self.motion is not None:
             self.motion = Brake(_SAFETY_DECEL_RAD_S2, linear=False)
         if mode in _PAUSING:
@@ -236,6 +290,12 @@ class Controller:
         self.safety_mode = SafetyMode.NORMAL
         return True
 
+    def restart_safety(self) -> None:
+        """Leave a safety fault or violation; the arm is powered off."""
+        if self.safety_mode in (SafetyMode.FAULT, SafetyMode.VIOLATION):
+            self.safety_mode = SafetyMode.NORMAL
+            self.power(RobotMode.POWER_OFF)
+
     def power(self, mode: RobotMode) -> None:
         """Power on (IDLE), release the brakes (RUNNING) or power off."""
         if mode is RobotMode.POWER_OFF:
@@ -248,9 +308,47 @@ class Controller:
 
     def restart(self) -> None:
         """Restart the controller: its clock from 0, no program, the arm powered off at its present position."""
-        self.arm.move_to(self.arm.q, PERIOD_S)
+        self.arm.move_to(self.arm.q, self.period_s)
         self._boot(RobotMode.POWER_OFF)
         self.inputs.clear()
+
+    def give_way(self, compliance: Compliance | None) -> None:
+        """Begin or, with None, end a mode in which the tool gives way to forces."""
+        self.energising += compliance is not None and self.compliance is None
+        self.compliance = compliance
+
+    def set_payload(self, mass_kg: float, centre_m: Array | None) -> None:
+        """Set mass and, unless None, centre of mass (3,) of the payload."""
+        self.energising += 1
+        self.payload_kg = mass_kg
+        if centre_m is not None:
+            self.payload_centre_m = centre_m
+
+    def felt_wrench(self) -> Array:
+        """Return the wrench (6,) on the tool as measured, along base axes."""
+        external = self.inputs.get("external_force_torque")
+        if self._takes_external_wrench:
+            return np.array(external, dtype=np.float64) if isinstance(external, tuple) else np.zeros(6)
+        return self.wrench - self._zero_wrench
+
+    def zero_wrench(self) -> None:
+        """Count the present wrench as none from now on."""
+        self.energising += 1
+        self._zero_wrench = self.wrench.copy()
+
+    def use_external_wrench(self, enable: bool) -> None:
+        """Take the wrench from the client's ``external_force_torque`` instead of the own sensor."""
+        self._takes_external_wrench = enable
+
+    def contact_steps(self, direction: Array) -> int:
+        """Return for how many periods the tool has had contact against ``direction`` (3,), in any if that is zero."""
+        length = float(np.linalg.norm(direction))
+        against = length == 0.0 or float(self.felt_wrench()[:3] @ direction) < -_CONTACT_N * length
+        return self._contact_periods if against else 0
+
+    def joints_before(self, steps: int) -> Array:
+        """Return the joint angles (6,) of ``steps`` periods ago, of the oldest known at most."""
+        return self._history[max(0, min(steps, len(self._history) - 1))]
 
     def set_tool(self, T_flange_tcp: Array) -> None:
         """Change the tool centre point."""
@@ -284,7 +382,7 @@ class Controller:
             "target_TCP_pose": pose,
             "actual_TCP_speed": twist,
             "target_TCP_speed": twist,
-            "actual_TCP_force": _six(self.wrench),
+            "actual_TCP_force": _six(self.felt_wrench()),
             "ft_raw_wrench": _six(self.wrench),
             "robot_mode": int(self.robot_mode),
             "safety_mode": int(self.safety_mode),
@@ -299,7 +397,8 @@ class Controller:
             "actual_main_voltage": self.voltage_v,
             "actual_robot_voltage": self.voltage_v,
             "actual_digital_output_bits": self.digital_outputs,
-            "payload": 0.0,
+            "payload": self.payload_kg,
+            "payload_cog": _six(self.payload_centre_m),
             "tcp_offset": _six(ur_model.pose_vector(arm.T_flange_tcp)),
         }
 

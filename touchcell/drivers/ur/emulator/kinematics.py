@@ -1,4 +1,4 @@
-"""Kinematics of e-Series arms: flange pose and velocity for given joint angles and speeds.
+"""Kinematics of e-Series and CB3 arms: flange pose and velocity for given joint angles and speeds.
 
 Denavit-Hartenberg parameters: Universal Robots, "DH parameters for calculations of kinematics and dynamics". A real arm
 differs by millimetres, because each has its own calibration.
@@ -32,6 +32,9 @@ MODELS: Mapping[str, Model] = MappingProxyType(
         "ur3e": Model((0.15185, 0.0, 0.0, 0.13105, 0.08535, 0.0921), (0.0, -0.24355, -0.2132, 0.0, 0.0, 0.0)),
         "ur5e": UR5E,
         "ur10e": Model((0.1807, 0.0, 0.0, 0.17415, 0.11985, 0.11655), (0.0, -0.6127, -0.57155, 0.0, 0.0, 0.0)),
+        "ur3": Model((0.1519, 0.0, 0.0, 0.11235, 0.08535, 0.0819), (0.0, -0.24365, -0.21325, 0.0, 0.0, 0.0)),
+        "ur5": Model((0.089159, 0.0, 0.0, 0.10915, 0.09465, 0.0823), (0.0, -0.425, -0.39225, 0.0, 0.0, 0.0)),
+        "ur10": Model((0.1273, 0.0, 0.0, 0.163941, 0.1157, 0.0922), (0.0, -0.612, -0.5723, 0.0, 0.0, 0.0)),
         "ur16e": Model((0.1807, 0.0, 0.0, 0.17415, 0.11985, 0.11655), (0.0, -0.4784, -0.36, 0.0, 0.0, 0.0)),
     }
 )

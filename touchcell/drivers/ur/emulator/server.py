@@ -1,4 +1,4 @@
-"""An emulated UR5e e-Series controller (PolyScope 5.11) on its real ports: RTDE, dashboard and script.
+"""An emulated UR controller (CB3, e-Series or PolyScope X) on its real ports: RTDE, dashboard and script.
 
 The ports are fixed on the robot and in its clients, so each emulator needs a loopback address of its own. The arm is
 kinematic: it follows commands exactly, without mass or contact. ``docs/devices/ur.md`` lists the sources.
@@ -10,23 +10,30 @@ import argparse
 import asyncio
 import contextlib
 import math
+import sys
 from collections.abc import Awaitable, Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 
+from touchcell.drivers.core.difference import report
 from touchcell.drivers.core.errors import CorruptMessage
+from touchcell.drivers.kinematics.chain import ChainDescription, SerialChain
+from touchcell.drivers.ur import capture
 from touchcell.drivers.ur import codec as ur_codec
+from touchcell.drivers.ur.capture import Capture
 from touchcell.drivers.ur.codec import IN_USE, NOT_FOUND, Packet, PacketType, Recipe, Value
 from touchcell.drivers.ur.emulator import kinematics as ur_model
 from touchcell.drivers.ur.emulator.controller import HOME_Q, Controller
-from touchcell.drivers.ur.emulator.program import PERIOD_S
+from touchcell.drivers.ur.emulator.generation import GENERATIONS
+from touchcell.drivers.ur.emulator.recorded import RecordedController
 from touchcell.drivers.ur.modes import RobotMode, RuntimeState, SafetyMode
+from touchcell.errors import ConfigError
 from touchcell.testing.emulation.base import Emulator
 
 DASHBOARD_PORT = 29999
 SCRIPT_PORTS = (30001, 30002, 30003)
-VERSION = (5, 11, 1, 108249)
 _POLYSCOPE_X = 10
 _MAX_LATE_S = 0.5
 _MAX_BUFFER_BYTES = 1 << 20
@@ -133,6 +140,14 @@ class UrEmulator(Emulator):
     Args:
         host: loopback address.
         unlock_after_s: time after a protective stop before it can be unlocked.
+        start_deg: joint angles at which it begins.
+        generation: name of its generation.
+        model: arm; None for the usual one of the generation.
+        version: its software; None for the usual one of the generation.
+        recorded: recorded traffic that it reports instead of its own state.
+
+    Raises:
+        ConfigError: the generation does not drive that arm.
     """
 
     faults: ClassVar[Mapping[str, str]] = {
@@ -170,16 +185,30 @@ class UrEmulator(Emulator):
         unlock_after_s: float = 5.0,
         start_deg: Sequence[float] | None = None,
         *,
-        model: str = "ur5e",
-        version: Sequence[int] = VERSION,
+        generation: str = "e",
+        model: str | None = None,
+        version: Sequence[int] | None = None,
+        recorded: Capture | None = None,
     ) -> None:
         super().__init__()
-        self._model = model
-        self._default_version = tuple(version)
+        self._recorded_types = {} if recorded is None else recorded.types
+        self._generation = GENERATIONS[generation]
+        self._model = model = model or self._generation.models[0]
+        if model not in self._generation.models:
+            known = ", ".join(self._generation.models)
+            raise ConfigError(f"generation {generation} has no such arm", key="model", value=model, hint=known)
+        self._default_version = tuple(version or self._generation.version)
         self._host = host
         self._unlock_after_s = unlock_after_s
-        self._controller = Controller(
-            unlock_after_s, HOME_Q if start_deg is None else np.radians(start_deg), ur_model.MODELS[model]
+        self._controller = (
+            RecordedController(recorded)
+            if recorded is not None
+            else Controller(
+                unlock_after_s,
+                HOME_Q if start_deg is None else np.radians(start_deg),
+                ur_model.MODELS[model],
+                self._generation.period_s,
+            )
         )
         self._servers: list[asyncio.Server] = []
         self._clients: list[_RtdeClient] = []
@@ -194,6 +223,11 @@ class UrEmulator(Emulator):
     @property
     def _version(self) -> tuple[int, ...]:
         return tuple(self.active.get("version", self._default_version))
+
+    @property
+    def _has_dashboard(self) -> bool:
+        is_old = self._generation.has_dashboard and self._version[0] < _POLYSCOPE_X
+        return is_old and "no_dashboard" not in self.active
 
     async def start(self) -> None:
         await self._listen()
@@ -252,6 +286,8 @@ class UrEmulator(Emulator):
         elif fault == "fault_bits":
             controller.stop_by_safety(SafetyMode(int(value)))
         elif fault == "local_control":
+            if not self._generation.has_remote_control:
+                raise ConfigError("this generation has no local control to switch to", key="fault", value=fault)
             controller.remote_control = False
         elif fault == "program_stop":
             controller.stop_program()
@@ -302,7 +338,7 @@ class UrEmulator(Emulator):
 
     async def _listen(self) -> None:
         services = [(ur_codec.PORT, self._serve_rtde)]
-        if self._version[0] < _POLYSCOPE_X and "no_dashboard" not in self.active:
+        if self._has_dashboard:
             services.append((DASHBOARD_PORT, self._serve_dashboard))
         services += [(port, self._serve_script) for port in SCRIPT_PORTS]
         for port, service in services:
@@ -348,7 +384,7 @@ class UrEmulator(Emulator):
         while True:
             # A late process catches up, because a controller's clock does not slow down, but reads its inputs between
             # any two steps; one that was suspended skips the lost time.
-            due_s = max(due_s + PERIOD_S, loop.time() - _MAX_LATE_S)
+            due_s = max(due_s + self._generation.period_s, loop.time() - _MAX_LATE_S)
             await asyncio.sleep(max(0.0, due_s - loop.time()))
             self._controller.step()
             self.publish_joints(self._controller.arm.q)
@@ -403,6 +439,9 @@ class UrEmulator(Emulator):
                 for packet in packets:
                     self._obey(client, packet)
                 await writer.drain()
+        except CorruptMessage as error:
+            self._controller.log(f"connection closed: {error}")
+            raise
         finally:
             if client in self._clients:
                 self._clients.remove(client)
@@ -427,10 +466,13 @@ class UrEmulator(Emulator):
     def _setup_outputs(self, client: _RtdeClient, payload: bytes) -> None:
         rate_hz, names = ur_codec.parse_setup_outputs(payload)
         missing = self.active.get("missing_variable")
-        types = [NOT_FOUND if name == missing else _output_type(name) for name in names]
+        unknown = self._generation.unknown_outputs | ({str(missing)} if missing else set())
+        types = [
+            NOT_FOUND if name in unknown else self._recorded_types.get(name) or _output_type(name) for name in names
+        ]
         if NOT_FOUND not in types:
             client.outputs = Recipe(1, names, tuple(types))
-            client.every = max(1, round(1.0 / (rate_hz * PERIOD_S)))
+            client.every = max(1, round(1.0 / (rate_hz * self._generation.period_s)))
         self._send(client.writer, ur_codec.recipe_answer(PacketType.SETUP_OUTPUTS, 1, types))
 
     def _setup_inputs(self, client: _RtdeClient, payload: bytes) -> None:
@@ -450,11 +492,9 @@ class UrEmulator(Emulator):
         text = b""
         while piece := await reader.read(65536):
             await self._awake.wait()
-            text += piece
-            # An `end` in the first column closes a program.
-            if text.endswith(b"\nend\n"):
-                self._controller.start_program(text.decode(errors="replace"))
-                text = b""
+            programs, text = _split_programs(text + piece)
+            for program in programs:
+                self._controller.start_program(program)
 
     async def _serve_dashboard(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         writer.write(b"Connected: Universal Robots Dashboard Server\n")
@@ -482,13 +522,21 @@ class UrEmulator(Emulator):
             "safetystatus": f"Safetystatus: {controller.safety_mode.name}",
             "running": f"Program running: {str(playing).lower()}",
             "programstate": f"{controller.runtime_state.name} rtde_control",
+            "get operational mode": "NONE",
             "close popup": "closing popup",
             "close safety popup": "closing safety popup",
             "quit": "Disconnected",
         }
         word = request.lower()
+        if word in self._generation.unknown_commands:
+            return f"could not understand: '{word}'"
         if word in questions:
             return questions[word]
+        if word.startswith("popup "):
+            return "showing popup"
+        if word.startswith("addtolog "):
+            controller.log(request.partition(" ")[2])
+            return "Added log message"
         if not controller.remote_control:
             return "Command is not allowed in local control"
         return self._command(word)
@@ -508,6 +556,9 @@ class UrEmulator(Emulator):
             if controller.unlock_protective_stop():
                 return "Protective stop releasing"
             return "Cannot unlock protective stop until 5s after occurrence"
+        if word == "restart safety":
+            controller.restart_safety()
+            return "Restarting safety"
         for command, mode, answer in (
             ("power on", RobotMode.IDLE, "Powering on"),
             ("brake release", RobotMode.RUNNING, "Brake releasing"),
@@ -517,6 +568,25 @@ class UrEmulator(Emulator):
                 controller.power(mode)
                 return answer
         return f"could not understand: '{word}'"
+
+
+def _split_programs(stream: bytes) -> tuple[list[str], bytes]:
+    """Return the complete programs in ``stream`` and the rest: each is one line, or ends with an ``end`` of its own."""
+    programs: list[str] = []
+    while stream:
+        line, newline, rest = stream.partition(b"\n")
+        if not newline:
+            break
+        if line.startswith((b"def ", b"sec ")):
+            body, found, after = stream.partition(b"\nend\n")
+            if not found:
+                break
+            programs.append((body + b"\nend\n").decode(errors="replace"))
+            rest = after
+        elif line.strip():
+            programs.append(line.decode(errors="replace"))
+        stream = rest
+    return programs, stream
 
 
 def _output_type(name: str) -> str:
@@ -553,23 +623,42 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--unlock-after", type=float, default=5.0, metavar="S", help="seconds before a protective stop can be unlocked"
     )
     parser.add_argument("--start-deg", type=float, nargs=6, metavar="DEG", help="joint angles at which it begins")
-    parser.add_argument("--model", choices=sorted(ur_model.MODELS), default="ur5e", help="model of the arm")
+    parser.add_argument(
+        "--generation", choices=sorted(GENERATIONS), default="e", help="CB3, e-Series, or e-Series with PolyScope X"
+    )
+    parser.add_argument(
+        "--from",
+        dest="capture",
+        type=Path,
+        metavar="CAPTURE",
+        help="report the states in this capture (pcap of port 30004), after what in it is not as expected",
+    )
+    parser.add_argument("--model", choices=sorted(ur_model.MODELS), help="model of the arm")
     parser.add_argument(
         "--version",
         type=int,
         nargs=4,
-        default=VERSION,
         metavar=("MAJOR", "MINOR", "BUGFIX", "BUILD"),
         help="software of the controller; from 10 on (PolyScope X) there is no dashboard",
     )
 
 
 def build(arguments: argparse.Namespace) -> UrEmulator:
-    """Build the emulator."""
+    """Build the emulator. Raises ConfigError."""
+    recorded, version = None, arguments.version
+    if arguments.capture is not None:
+        chain = SerialChain(ChainDescription.shipped(arguments.model)) if arguments.model else None
+        recorded = capture.read(arguments.capture, _output_type, chain)
+        version = version or recorded.version
+        found = list(report(recorded.differences)) or ["nothing contradicts codec or emulator"]
+        for line in [*capture.describe(recorded), *found]:
+            print(line, file=sys.stderr)
     return UrEmulator(
         arguments.host,
         arguments.unlock_after,
         arguments.start_deg,
+        generation=arguments.generation,
         model=arguments.model,
-        version=arguments.version,
+        version=version,
+        recorded=recorded,
     )

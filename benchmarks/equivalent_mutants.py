@@ -1,0 +1,90 @@
+"""Mutants that no test can notice, because what they change has no effect that anything outside can see.
+
+Each is named by its module, the line of source that it changes and the change, with the reason. A line that is edited
+loses its entries, so that a reason cannot outlive the code that it is about.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Final
+
+SHORTCUT: Final = "a shortcut that gives what the rest would"
+EXACT: Final = "differs only where a computed number equals its limit to the last bit"
+MIDDLE: Final = "both are equal only in the middle of the box"
+BEYOND: Final = "the rows or columns that it adds are not read, or do not exist"
+SOMEWHERE: Final = "where an imagined pair stands decides nothing"
+
+EQUIVALENT: Mapping[tuple[str, str, str], str] = {
+    ("gate", "if linear <= max_linear and angular <= max_angular:", "if -> if False"): SHORTCUT,
+    ("gate", "if linear <= max_linear and angular <= max_angular:", "LtE -> Lt"): SHORTCUT,
+    ("gate", "_NEGLIGIBLE = 1e-12", "1e-12 -> 2e-12"): "a way of a picometre per second",
+    ("gate", "if left > _NEGLIGIBLE:", "Gt -> GtE"): "a way of a picometre per second",
+    ("gate", "if asked > jerk * _ROUNDING:", "Gt -> GtE"): EXACT,
+    ("gate", "if size > limit * _ROUNDING:", "Gt -> GtE"): EXACT,
+    (
+        "gate",
+        "asked = max(step, rate * left if smooth < rate else 0.0) / dt_s",
+        "Lt -> LtE",
+    ): "both are equal only where neither asks for more than the jerk",
+    ("boundary", "return self.inward >= self.rest and self.inward >= _INWARD_SHARE * self.speed", "GtE -> Gt"): EXACT,
+    ("boundary", "return self.measured_inward >= least", "GtE -> Gt"): EXACT,
+    ("boundary", "above = p[axis] - high[axis] > low[axis] - p[axis]", "Gt -> GtE"): MIDDLE,
+    ("boundary", "0.0 if excess <= 0.0 else excess if x - b > a - x else -excess", "Gt -> GtE"): MIDDLE,
+    (
+        "boundary",
+        "0.0 if excess <= 0.0 else excess if x - b > a - x else -excess",
+        "LtE -> Lt",
+    ): "0 and -0 are both no way out",
+    (
+        "boundary",
+        "return float(turning @ self.direction) / max(math.sin(tilt_rad), 1e-9), math.sqrt(float(turning @ turning))",
+        "1e-09 -> 2e-09",
+    ): "only keeps a division by zero away",
+    ("pair", "T_world_sensor[:3, 3] = [0.1 * side, 0.0, 0.3]", "Mult -> Div"): "a side is 1 or -1",
+    ("pair", "T_world_sensor[:3, 3] = [0.1 * side, 0.0, 0.3]", "0.3 -> 0.6"): SOMEWHERE,
+    ("pair", "T_world_sensor[:3, 3] = [0.1 * side, 0.0, 0.3]", "0.1 -> 0.2"): SOMEWHERE,
+    ("pair", "shear = -sensor.T_s_f[:3, :3].T @ sensor.T_s_f[:3, 3]", "-x -> +x"): "only its size counts",
+    ("pair", "shear = -sensor.T_s_f[:3, :3].T @ sensor.T_s_f[:3, 3]", "3 -> 6"): BEYOND,
+    ("pair", "R = carried.pose(view, sensor)[:3, :3] @ sensor.T_s_f[:3, :3]", "3 -> 6"): BEYOND,
+    ("pair", "down = T_world_sensor[:3, :3].T @ np.array([0.0, 0.0, -1.0])", "3 -> 6"): BEYOND,
+    ("pair", "down = T_world_sensor[:3, :3].T @ np.array([0.0, 0.0, -1.0])", "-x -> +x"): "it slides up",
+    (
+        "pair",
+        "upright = np.array([0.0, 0.0, 0.0, 0.0, -0.5 * math.pi * side, 0.0])",
+        "Mult -> Div",
+    ): "a side is 1 or -1",
+    ("pair", "leaning = np.array([0.0, 0.0, 0.0, 0.0, -lean_rad, 0.0])", "-x -> +x"): "it leans to the other side",
+    ("collision", "_TINY = 1e-30", "1e-30 -> 2e-30"): "only keeps a division by zero away",
+    ("collision", "if i.size:", "if -> if True"): SHORTCUT,
+    ("collision", "if k.size:", "if -> if True"): SHORTCUT,
+    ("motion", "command = TwistCommand(twist, TwistFrame.BASE, view.now_ns, 0.03)", "0.03 -> 0.06"): (
+        "nothing reads the time-to-live of a fault's command"
+    ),
+    ("motion", "position = arm.state.value.T_base_tcp[:3, 3]", "3 -> 6"): BEYOND,
+    ("always_on", "if not view.sensors.keys() <= past.keys():", "if -> if True"): SHORTCUT,
+    ("always_on", "if not view.sensors.keys() <= past.keys():", "LtE -> Lt"): SHORTCUT,
+    (
+        "always_on",
+        "if self.arms <= view.arms.keys() and self.sensors <= view.sensors.keys():",
+        "if -> if False",
+    ): SHORTCUT,
+    ("always_on", "if self.arms <= view.arms.keys() and self.sensors <= view.sensors.keys():", "LtE -> Lt"): SHORTCUT,
+    ("always_on", "return replace(view, now_ns=view.now_ns + round(1e9 * SILENCE_S))", "Mult -> Div"): "it is 1 s",
+    ("supervisor", "if not names and not self._limiting:", "if -> if False"): SHORTCUT,
+    ("supervisor", "if total_ns or name in names:", "if -> if True"): "an entry that counts nothing is as none",
+    ("collision", "safe = np.where(np.abs(d) > _TINY, d, 1.0)", "Gt -> GtE"): EXACT,
+    ("collision", "rising = np.where(slope[:, -1] < 0.0, 7, rising)", "Lt -> LtE"): EXACT,
+    (
+        "collision",
+        "share = np.where(change > 0.0, np.clip(-low / np.where(change > 0.0, change, 1.0), 0.0, 1.0), 0.0)",
+        "Gt -> GtE",
+    ): EXACT,
+    ("collision", "best = np.where(slope[:, -1] < 0.0, 1.0, best)", "Lt -> LtE"): EXACT,
+}
+"""Reason by module, line of source without its indentation, and change."""
+
+
+def equivalent(module: str, source: str, line: int, what: str) -> str:
+    """Return the reason why a mutant of ``source`` at ``line`` is equivalent; "" if it is not known to be."""
+    return EQUIVALENT.get((module, source.splitlines()[line - 1].strip(), what), "")

@@ -1,0 +1,105 @@
+"""The filter that knows slip: shear and torsion of contacts whose skin has slid, from frames that cannot tell."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from touchcell.geometry import gaussian, se3
+from touchcell.perception.runtime.filter import PoseFilter, isotropic_noise
+from touchcell.perception.runtime.filter_spec import ContactFilter
+from touchcell.perception.runtime.slip_aware import SlipAwareConfig, SlipAwareFilter
+from touchcell.perception.runtime.stick_slip import StickSlipFilter
+from touchcell.simulation.contact import ContactLaw
+from touchcell.simulation.sequences import Sequence, random_sequence
+
+SIGMA = np.array([0.1e-3, 0.1e-3, 0.05e-3, 0.006, 0.006, 0.005])
+PERIOD_NS = 33_333_333
+DRIFT = isotropic_noise(0.05e-3, np.deg2rad(0.2))
+
+
+def slip_aware() -> SlipAwareFilter:
+    return SlipAwareConfig(model="slip_aware").build()
+
+
+def errors(sequence: Sequence, contact_filter: ContactFilter | None, seed: int = 0) -> np.ndarray:
+    """Errors (n, 6) mm and deg of frames that show what the skin holds, filtered."""
+    rng, found = np.random.default_rng(seed), []
+    for k, (sensor, held) in enumerate(zip(sequence.T_f_s, sequence.held, strict=True)):
+        xi = se3.log(se3.inverse(held)) + SIGMA * rng.standard_normal(6)
+        belief = gaussian.from_exponential(xi, np.diag(SIGMA**2))
+        if contact_filter is not None:
+            belief = contact_filter.update(belief, sensor, k * PERIOD_NS).belief
+        found.append(se3.to_euler_mm_deg(se3.inverse(belief.mean)) - se3.to_euler_mm_deg(sensor))
+    return np.array(found)
+
+
+def rms(values: np.ndarray) -> np.ndarray:
+    root: np.ndarray = np.sqrt((values**2).mean(axis=0))
+    return root
+
+
+@pytest.mark.parametrize("friction", [0.6, 1.0, 1.5])
+def test_shear_and_torsion_err_by_less_than_half_of_what_other_filters_leave_while_the_skin_slips(
+    friction: float,
+) -> None:
+    law = ContactLaw(slip_at_1mm_m=0.34e-3 * friction, torsion_grip=0.1 * friction)
+    sequences = [random_sequence(240, seed, law) for seed in range(4)]
+    slipping = np.concatenate([sequence.slipping for sequence in sequences])
+    rivals: list[ContactFilter | None] = [None, PoseFilter(DRIFT), StickSlipFilter(100 * DRIFT, 0.5)]
+    ours = np.concatenate([errors(sequence, slip_aware()) for sequence in sequences])
+    for rival in rivals:
+        theirs = []
+        for sequence in sequences:
+            if rival is not None:
+                rival.reset()
+            theirs.append(errors(sequence, rival))
+        others = np.concatenate(theirs)
+        for chosen in (slipping, ~slipping):
+            assert (rms(ours[chosen])[[0, 1, 5]] < 0.5 * rms(others[chosen])[[0, 1, 5]]).all()
+            assert (rms(ours[chosen])[2:5] < 1.05 * rms(errors_of_frames(sequences))[2:5]).all()
+
+
+def errors_of_frames(sequences: list[Sequence]) -> np.ndarray:
+    return np.concatenate([errors(sequence, None) for sequence in sequences])
+
+
+def test_a_contact_that_never_slips_is_averaged_as_by_the_filter_of_a_still_surface() -> None:
+    sequence = random_sequence(200, 1, ContactLaw(slip_at_1mm_m=20e-3, torsion_grip=1.0))
+    assert not sequence.slipping.any()
+    assert (rms(errors(sequence, slip_aware())) < rms(errors(sequence, None))).all()
+
+
+def test_slip_is_remembered_for_as_long_as_the_contact_lasts() -> None:
+    sequence, contact_filter = random_sequence(240, 0, ContactLaw(torsion_grip=0.1)), slip_aware()
+    errors(sequence, contact_filter)
+    assert contact_filter.slipped > 0.99
+    contact_filter.reset()
+    assert contact_filter.state is None
+    assert contact_filter.slipped < 0.1
+
+
+def test_sigma_of_shear_grows_where_frames_say_nothing_of_it() -> None:
+    contact_filter, sigmas = slip_aware(), []
+    covariance = np.diag(SIGMA**2)
+    for k in range(300):
+        x_mm = min(0.1 * k, 1.0)
+        held = se3.from_euler_mm_deg(np.array([x_mm, 0.0, 1.5, 0.0, 0.0, 0.0]))
+        sensor = se3.from_euler_mm_deg(np.array([0.1 * k, 0.0, 1.5, 0.0, 0.0, 0.0]))
+        observed = gaussian.from_exponential(se3.log(se3.inverse(held)), covariance)
+        state = contact_filter.update(observed, sensor, k * PERIOD_NS)
+        sigmas.append(np.sqrt(np.diagonal(state.belief.covariance)))
+    assert sigmas[-1][0] > 1.5 * sigmas[30][0]
+    assert sigmas[-1][2] < 0.5 * sigmas[-1][0]
+
+
+def test_frames_closer_together_than_they_are_independent_count_as_one() -> None:
+    sigmas = []
+    for frames in (10, 100):
+        contact_filter = SlipAwareFilter(1e-12 * np.eye(6), 4e-3, 0.07, correlation_s=0.5)
+        T_f_s = se3.from_euler_mm_deg(np.array([0.0, 0.0, 3.0, 0.0, 0.0, 0.0]))
+        observed = gaussian.from_exponential(se3.log(se3.inverse(T_f_s)), np.diag(SIGMA**2))
+        for k in range(frames + 1):
+            state = contact_filter.update(observed, T_f_s, round(k * 5e9 / frames))
+        sigmas.append(np.sqrt(np.diagonal(state.belief.covariance)))
+    np.testing.assert_allclose(sigmas[0], sigmas[1], rtol=0.05)

@@ -1,0 +1,1 @@
+"""Gamepads by the Linux input subsystem: jog input with a dead-man trigger."""

@@ -1,0 +1,1 @@
+"""Driver, codec and emulator of Robotiq 2F grippers."""

@@ -1,0 +1,1 @@
+"""3Dconnexion SpaceMouse: jog input in six axes with a dead-man button."""

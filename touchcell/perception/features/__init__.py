@@ -1,0 +1,1 @@
+"""What a tip touches: nothing, a surface, an edge or a corner, with probabilities."""
