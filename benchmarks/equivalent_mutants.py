@@ -73,6 +73,14 @@ EQUIVALENT: Mapping[tuple[str, str, str], str] = {
     ("always_on", "return replace(view, now_ns=view.now_ns + round(1e9 * SILENCE_S))", "Mult -> Div"): "it is 1 s",
     ("supervisor", "if not names and not self._limiting:", "if -> if False"): SHORTCUT,
     ("supervisor", "if total_ns or name in names:", "if -> if True"): "an entry that counts nothing is as none",
+    ("collision", "safe = np.where(np.abs(d) > _TINY, d, 1.0)", "Gt -> GtE"): EXACT,
+    ("collision", "rising = np.where(slope[:, -1] < 0.0, 7, rising)", "Lt -> LtE"): EXACT,
+    (
+        "collision",
+        "share = np.where(change > 0.0, np.clip(-low / np.where(change > 0.0, change, 1.0), 0.0, 1.0), 0.0)",
+        "Gt -> GtE",
+    ): EXACT,
+    ("collision", "best = np.where(slope[:, -1] < 0.0, 1.0, best)", "Lt -> LtE"): EXACT,
 }
 """Reason by module, line of source without its indentation, and change."""
 

@@ -36,17 +36,13 @@ _ON_SURFACE_M: Final = 9e-3
 _FARTHEST_M: Final = 18e-3
 _SHARPEST_BEND_COS: Final = math.cos(math.radians(40.0))
 _RANGES: Final = EdgeRanges(depth_mm=(0.8, 6.0), turn_deg=180.0)
-_VARIATION: Final = Variation(
-    parameters=0.01, turn_rad=0.002, shift_px=0.3, marker_px=0.1, disc_radius=0.03, missing=0.002
-)
-"""That of the estimators that ship: sensors of one kind."""
 _MOST_TRIES: Final = 30
 
 
 def feature_contacts(n: int, seed: int, *, variation: Variation | None = None) -> Iterator[tuple[int, Array]]:
     """Yield ``n`` pairs of an index of ``CLASSES`` and (markers, 2) px in the frame, the same for the same seed."""
     rng = np.random.default_rng(seed)
-    variation, law = variation or _VARIATION, ContactLaw()
+    variation, law = variation or Variation(), ContactLaw()
     for start in range(0, n, _CONTACTS_PER_TIP):
         tip = Tip(scattered(TipParameters(), variation, rng))
         part = MeshShape(random_part(rng), _CREASE_RAD)

@@ -22,8 +22,8 @@ from touchcell.tasks.surface_path import Guide, PathConfig
 
 _APPROACH_M = 0.02
 """The first contact is hardly farther from the start than this."""
-_PATH_BEND, _WAY_BEND = 0.5, 0.7
-"""Shares of a way by which its end may be elsewhere: on a plane tilted by 30 deg, and over half a cylinder."""
+_BEND = 0.5
+"""Share of a way by which its end may be elsewhere: on a plane tilted by 30 deg."""
 
 
 class SurfaceFollowingConfig(ServoConfig):
@@ -136,18 +136,13 @@ def _behavior(config: SurfaceFollowingConfig) -> Follow | FollowPath:
 
 
 def _places(config: SurfaceFollowingConfig, T_base_tcp: Array | None, T_tcp_sensor: Array) -> Iterator[PlannedPlace]:
-    """Return the corners of the path, or the end of the straight way, near enough to the plane of the first contact."""
-    if T_base_tcp is None:
+    """Return the corners of the path, near the plane of the first contact; a straight way may end anywhere."""
+    if config.path is None or T_base_tcp is None:
         return
-    direction_rad, distance_m = math.radians(config.direction_deg), 1e-3 * config.distance_mm
-    key, bend, points = "path", _PATH_BEND, [] if config.path is None else config.path.points()
-    if not points:
-        key, bend = "distance_mm", _WAY_BEND
-        points = [(distance_m * math.cos(direction_rad), distance_m * math.sin(direction_rad))]
     T_base_sensor = T_base_tcp @ T_tcp_sensor
-    for x, y in points:
+    for x, y in config.path.corners():
         tip_m = T_base_sensor[:3, 3] + T_base_sensor[:3, :2] @ np.array([x, y])
-        yield PlannedPlace((key,), ARM, tip_m=tip_m, slack_m=_APPROACH_M + bend * math.hypot(x, y))
+        yield PlannedPlace(("path",), ARM, tip_m=tip_m, slack_m=_APPROACH_M + _BEND * math.hypot(x, y))
 
 
 SPEC = one_arm_task(

@@ -18,6 +18,7 @@ from touchcell.geometry.types import Array
 from touchcell.tasks.interface import TaskConfig
 
 _STEP_RAD: Final = math.radians(10.0)
+_MOST_LINES, _MOST_TURNS = 10_000, 10_000
 # Where the surface is steeper than this, the way to go is taken along the surface, not exactly below the path.
 _STEEPEST_COS: Final = 0.3
 
@@ -35,6 +36,21 @@ class RasterConfig(TaskConfig):
     size_mm: tuple[PositiveFloat, PositiveFloat]
     spacing_mm: PositiveFloat
     turn_deg: float = 0.0
+
+    @model_validator(mode="after")
+    def _not_too_long(self) -> RasterConfig:
+        if self.size_mm[1] / self.spacing_mm > _MOST_LINES:
+            raise ValueError(f"spacing_mm {self.spacing_mm:g} makes more than {_MOST_LINES} lines of size_mm")
+        return self
+
+    def corners(self) -> list[Point]:
+        """Return points, m, of the path that are farthest from the first contact."""
+        along, across = (0.5e-3 * size for size in self.size_mm)
+        sin, cos = math.sin(math.radians(self.turn_deg)), math.cos(math.radians(self.turn_deg))
+        return [
+            (cos * x - sin * y, sin * x + cos * y)
+            for x, y in ((along, across), (-along, across), (-along, -across), (along, -across))
+        ]
 
     def points(self) -> list[Point]:
         """Return the corners of the path, m, from the first contact on."""
@@ -58,6 +74,17 @@ class SpiralConfig(TaskConfig):
     kind: Literal["spiral"]
     radius_mm: PositiveFloat
     spacing_mm: PositiveFloat
+
+    @model_validator(mode="after")
+    def _not_too_long(self) -> SpiralConfig:
+        if self.radius_mm / self.spacing_mm > _MOST_TURNS:
+            raise ValueError(f"spacing_mm {self.spacing_mm:g} makes more than {_MOST_TURNS} turns within radius_mm")
+        return self
+
+    def corners(self) -> list[Point]:
+        """Return points, m, of the last turn."""
+        radius = 1e-3 * self.radius_mm
+        return [(radius * math.cos(a), radius * math.sin(a)) for a in np.linspace(0.0, 2.0 * math.pi, 9).tolist()]
 
     def points(self) -> list[Point]:
         """Return the corners of the path, m, from the first contact on."""
@@ -83,6 +110,10 @@ class ThroughConfig(TaskConfig):
         if any(math.dist(a, b) < 0.01 for a, b in pairwise(points)):
             raise ValueError("points_mm has the same point twice in a row, or begins with the first contact")
         return self
+
+    def corners(self) -> list[Point]:
+        """Return the points, m."""
+        return self.points()[1:]
 
     def points(self) -> list[Point]:
         """Return the corners of the path, m, from the first contact on."""

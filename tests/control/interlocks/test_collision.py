@@ -131,3 +131,22 @@ def test_no_pairs_give_no_distances():
     nothing = Clearances({"arm": []}, {"arm": 2}, [])
     assert nothing.pairs == ()
     assert nothing.distances(np.tile(np.eye(4), (2, 1, 1))).shape == (0,)
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "apart"),
+    [
+        ((1, 3), (6, 8), False),
+        ((1, 2), (6, 8), True),
+        ((3, 1), (8, 6), False),
+        ((2, 1), (8, 6), True),
+        ((1, 8), (4, 4), False),
+    ],
+)
+def test_parts_of_one_arm_are_compared_where_their_nearest_links_are_four_apart(
+    first: tuple[int, int], second: tuple[int, int], apart: bool
+) -> None:
+    ends = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.1))
+    for frames in ((first, second), (second, first)):
+        parts = [Capsule(name, each, ends, 0.05) for name, each in zip("ab", frames, strict=True)]
+        assert bool(Clearances({"arm": parts}, {"arm": 10}, []).pairs) == apart

@@ -259,13 +259,20 @@ def _contacts(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
     for name in plan.sensor_roles.values():
         sensor = plan.cell.sensors[name]
         if sensor.mounted_on is not None and (start := _start(plan, sensor.mounted_on)) is not None:
-            base = plan.cell.arms[sensor.mounted_on].base_pose_mm_deg
-            arms[name], tips[name] = sensor.mounted_on, se3.from_euler_mm_deg(base) @ start @ sensor.T_tcp_sensor
+            base = _pose(plan.cell.arms[sensor.mounted_on].base_pose_mm_deg)
+            if base is not None:
+                arms[name], tips[name] = sensor.mounted_on, base @ start @ sensor.T_tcp_sensor
     scene = scene_section().model_validate(plan.cell.scene)
+    try:
+        pressed = scene.pressed(tips)
+    except (ConfigError, GeometryError) as error:
+        key = error.key if isinstance(error, ConfigError) else ""
+        yield file.problem(("scene", *key.split(".")), str(error), hint="put it right")
+        return
     if plan.task.feature == "edge" and not scene.has_edges():
         hint = "e.g. {disc: {kind: cylinder, radius_mm: 50, height_mm: 20}}"
         yield file.problem(("scene", "surfaces"), f"no surface has an edge, which {plan.task.name} needs", hint=hint)
-    for name, depth_m in scene.pressed(tips).items():
+    for name, depth_m in pressed.items():
         yield file.problem(
             ("arms", arms[name], "start_pose_mm_deg"),
             f"the tip of {name!r} is {1e3 * depth_m:.1f} mm deep in something there, but the task starts free",
@@ -276,7 +283,15 @@ def _contacts(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
 def _start(plan: CellPlan, arm: str) -> Array | None:
     """Pose (4, 4) of an arm's tool in its base frame at the start, if the cell knows it."""
     pose = getattr(plan.arms[arm].config, "start_pose_mm_deg", None)
-    return None if pose is None else se3.from_euler_mm_deg(pose)
+    return None if pose is None else _pose(pose)
+
+
+def _pose(pose_mm_deg: Any) -> Array | None:
+    """Pose (4, 4) of six numbers; None if they are none."""
+    try:
+        return se3.from_euler_mm_deg(pose_mm_deg)
+    except GeometryError:
+        return None
 
 
 def _limits(plan: CellPlan, kind: str, key: str) -> Mapping[str, float]:

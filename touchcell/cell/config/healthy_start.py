@@ -26,8 +26,10 @@ if TYPE_CHECKING:
 _OF_PLACES: Final = ("tilt", "clearance")
 _OF_TIMES: Final = ("frame_age", "arm_state_age", "frame_frozen")
 _START_NS: Final = 10**12
-_SHOWN_S: Final = 1.0
+_SHOWN_S: Final = 0.3
 _FRAMES: Final = 3
+_LONGEST_S: Final = 2.0
+"""Limits of age above it are refused anyway."""
 
 
 def trips_when_healthy(plan: CellPlan, facts: CellFacts) -> Iterator[NotArmed]:
@@ -43,8 +45,9 @@ def trips_when_healthy(plan: CellPlan, facts: CellFacts) -> Iterator[NotArmed]:
     frames = {role: _frame_times(plan, role, facts) for role in facts.sensors}
     states_s = {role: _state_period_s(plan, name) for name, role in arm_roles(plan).items()}
     poses = {role: sensor.T_tcp_sensor for role, sensor in facts.sensors.items()}
-    last_s = max([_SHOWN_S, *(latency_s + _FRAMES * period_s for latency_s, period_s in frames.values())])
     first_s = max([0.0, *(latency_s + period_s for latency_s, period_s in frames.values())])
+    shown_s = max([_SHOWN_S, *(_FRAMES * period_s for _, period_s in frames.values())])
+    cycles = math.ceil(min(shown_s, _LONGEST_S) / facts.period_s)
     for name, entry in plan.cell.interlocks.items():
         at_start = entry.kind in _OF_PLACES
         if not (entry.kind in _OF_TIMES or (at_start and _is_placed(entry, starts, facts))):
@@ -54,7 +57,7 @@ def trips_when_healthy(plan: CellPlan, facts: CellFacts) -> Iterator[NotArmed]:
         quiet.disabled = True
         latch = Latch(quiet)
         supervisor = Supervisor([interlock], latch)
-        for k in range(math.ceil((last_s + first_s) / facts.period_s) + 1):
+        for k in range(1 if at_start else cycles):
             t_s = first_s + k * facts.period_s
             supervisor.review(_view(facts, t_s, starts, frames, states_s))
             if (cause := latch.first_cause) is not None:

@@ -12,8 +12,8 @@ from touchcell.tasks.planned_places import PlannedPlace
 from touchcell.tasks.servoing import ARM
 from touchcell.tasks.steps.model import Move, Repeat, Retract, Servo, Step
 
-_MOST_TIMES = 100
-"""Repetitions that are followed: what drifts out of a box does so before."""
+_MOST_FOLLOWED = 2000
+"""Steps that are followed, repetitions counted: what drifts out of a box does so before."""
 
 
 def planned_places(steps: Sequence[Step], T_base_tcp: Array | None, T_tcp_sensor: Array) -> Iterator[PlannedPlace]:
@@ -26,33 +26,47 @@ def planned_places(steps: Sequence[Step], T_base_tcp: Array | None, T_tcp_sensor
         T_base_tcp: (4, 4) where the arm starts; None if that is not known.
         T_tcp_sensor: (4, 4) mount of the sensor.
     """
-    yield from _followed(steps, ("steps",), [T_base_tcp], T_tcp_sensor)
+    return _Way(T_base_tcp, T_tcp_sensor).followed(steps, ("steps",))
 
 
-def _followed(
-    steps: Sequence[Step], at: tuple[str | int, ...], now: list[Array | None], T_tcp_sensor: Array
-) -> Iterator[PlannedPlace]:
-    """Follow ``steps`` from the pose in ``now``, which is kept up to date; None there is a pose that is not known."""
-    for index, step in enumerate(steps):
-        key = (*at, index, step.kind)
-        if isinstance(step, Repeat):
-            for _ in range(min(step.times, _MOST_TIMES)):
-                before = now[0]
-                yield from _followed(step.steps, (*key, "steps"), now, T_tcp_sensor)
-                if now[0] is before or now[0] is None:
-                    break
-        elif isinstance(step, Move):
-            goal = _goal(step, now[0], T_tcp_sensor)
-            now[0] = goal if step.until is None else None
-            if goal is not None and step.until is None:
-                yield PlannedPlace((*key, "by_mm_deg" if step.to_mm_deg is None else "to_mm_deg"), ARM, goal)
-        elif isinstance(step, Servo):
-            now[0] = None
-        elif isinstance(step, Retract) and now[0] is not None:
-            back = np.eye(4)
-            back[2, 3] = -1e-3 * step.distance_mm
-            now[0] = _along(now[0], T_tcp_sensor, back)
-            yield PlannedPlace((*key, "distance_mm"), ARM, now[0])
+class _Way:
+    """Where the arm is after the steps so far; None once a sensor has decided about it."""
+
+    def __init__(self, T_base_tcp: Array | None, T_tcp_sensor: Array) -> None:
+        self._T_base_tcp = T_base_tcp
+        self._T_tcp_sensor = T_tcp_sensor
+        self._left = _MOST_FOLLOWED
+
+    def followed(self, steps: Sequence[Step], at: tuple[str | int, ...]) -> Iterator[PlannedPlace]:
+        """Return the places to which ``steps`` lead, whose key is ``at``."""
+        for index, step in enumerate(steps):
+            self._left -= 1
+            if self._left < 0:
+                return
+            key = (*at, index, step.kind)
+            if isinstance(step, Repeat):
+                yield from self._repeated(step, (*key, "steps"))
+            elif isinstance(step, Move):
+                goal = _goal(step, self._T_base_tcp, self._T_tcp_sensor)
+                self._T_base_tcp = goal if step.until is None else None
+                if self._T_base_tcp is not None:
+                    name = "by_mm_deg" if step.to_mm_deg is None else "to_mm_deg"
+                    yield PlannedPlace((*key, name), ARM, self._T_base_tcp)
+            elif isinstance(step, Servo):
+                self._T_base_tcp = None
+            elif isinstance(step, Retract) and self._T_base_tcp is not None:
+                back = np.eye(4)
+                back[2, 3] = -1e-3 * step.distance_mm
+                self._T_base_tcp = _along(self._T_base_tcp, self._T_tcp_sensor, back)
+                yield PlannedPlace((*key, "distance_mm"), ARM, self._T_base_tcp)
+
+    def _repeated(self, step: Repeat, at: tuple[str | int, ...]) -> Iterator[PlannedPlace]:
+        for _ in range(step.times):
+            before = self._T_base_tcp
+            yield from self.followed(step.steps, at)
+            # What does not change the place leads nowhere else the next time.
+            if self._left < 0 or self._T_base_tcp is before:
+                return
 
 
 def _goal(step: Move, T_base_tcp: Array | None, T_tcp_sensor: Array) -> Array | None:
