@@ -81,6 +81,7 @@ EQUIVALENT: Mapping[tuple[str, str, str], str] = {
         "Gt -> GtE",
     ): EXACT,
     ("collision", "best = np.where(slope[:, -1] < 0.0, 1.0, best)", "Lt -> LtE"): EXACT,
+    ("rest", "_MOST_SEEN: Final = 1000", "1000 -> 2000"): "only bounds the memory",
 }
 """Reason by module, line of source without its indentation, and change."""
 

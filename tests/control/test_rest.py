@@ -161,6 +161,16 @@ def test_a_speed_above_what_it_measured_while_it_stood_is_a_motion_that_has_begu
     )
 
 
+@pytest.mark.parametrize(("begun_ms", "at_rest"), [(50, False), (95, False), (150, True)])
+def test_what_is_measured_for_a_tenth_of_a_second_while_the_positions_stay_is_usual(
+    begun_ms: int, at_rest: bool
+) -> None:
+    faster = 3.0 * np.array(NOISE)
+    begun_ns = 600_000_000 - 1_000_000 * begun_ms
+    times_ns = range(0, 600_000_001, CYCLE_NS)
+    assert judged(view(t, standing(t), faster if t > begun_ns else NOISE) for t in times_ns) == at_rest
+
+
 speeds_mm_s = st.one_of(st.just(0.0), st.floats(-20.0, 20.0), st.floats(-0.9, 0.9))
 
 
