@@ -31,6 +31,7 @@ BENCHMARKS = {
     "phantom": "benchmarks.phantom",
     "pushes": "benchmarks.pushes",
     "recipe": "benchmarks.recipe",
+    "recording": "benchmarks.recording",
     "kinematics": "benchmarks.kinematics",
     "safety": "tests.fault_injection.safety",
     "safety-against": "benchmarks.safety_against",

@@ -43,7 +43,8 @@ def test_a_lost_object_is_searched_for_and_pushed_again(tmp_path):
             slider = cell.scene.world._sliders["prism"]
             moved.append(slider.move((0.015, 0.0, 0.0), 0.0))
 
-    data = cell_file(CELL, **SHORT | {"task__target_mm": [80, 0]})
+    # Where the side was touched again, no edge was felt.
+    data = cell_file(CELL, **SHORT | {"task__target_mm": [80, 0], "task__arrival_tolerance_mm": 8})
     pushed = push(data, tmp_path, snatch)
     assert pushed.path == [*WHOLE[:3], ("run", "lost", "approach"), *WHOLE[1:]]
     assert "sensor" in pushed.cell.task.transitions[3].reason

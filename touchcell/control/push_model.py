@@ -34,7 +34,7 @@ _WINDOW_M: Final = 0.020
 _LATERAL_NOISE_M: Final = 0.25e-3
 _HEADING_NOISE_RAD: Final = math.radians(0.3)
 _OFFSET_PRIOR_M: Final = 0.015
-_LEVER_PRIOR: Final = 0.25
+_LEVER_PRIOR: Final = 0.15
 """Standard deviation of ``c^2`` over its first value."""
 _CREEP_M_PER_SQRT_M: Final = 0.003
 """Growth of the uncertainty of where an object is touched over travel: contacts creep."""

@@ -62,6 +62,7 @@ class _Remembered:
         self.name = rule.name
         self.severity = rule.severity
         self._rule = rule
+        self._levelled = rule if isinstance(rule, Levelled) else None
         self._past: InterlockState = NO_MARKS
 
     def check(self, view: CellView) -> Violation | None:
@@ -69,8 +70,8 @@ class _Remembered:
         return violation
 
     def levels(self, view: CellView, past: InterlockState) -> Iterator[Level]:
-        if isinstance(self._rule, Levelled):
-            yield from self._rule.levels(view, self._past)
+        if self._levelled is not None:
+            yield from self._levelled.levels(view, self._past)
 
 
 class Supervisor:
@@ -97,6 +98,7 @@ class Supervisor:
         self._finite = Finite()
         # Classified once: isinstance with a Protocol costs more than most interlocks.
         self._rules = tuple(_Remembered(rule) if isinstance(rule, TimedInterlock) else rule for rule in interlocks)
+        self._levelled = tuple((rule.name, rule) for rule in self._rules if isinstance(rule, Levelled))
         self._latch = latch
         self._rest = RestMonitor(rest_m_s, rest_rad_s)
         self._limiting: dict[str, _Limiting] = {}
@@ -135,11 +137,10 @@ class Supervisor:
         found: list[tuple[str, Level]] = []
         if self._view is None:
             return found
-        for rule in self._rules:
-            if isinstance(rule, Levelled):
-                # What is only shown disturbs nothing.
-                with suppress(Exception):
-                    found += [(rule.name, level) for level in rule.levels(self._view, NO_MARKS)]
+        for name, rule in self._levelled:
+            # What is only shown disturbs nothing.
+            with suppress(Exception):
+                found += [(name, level) for level in rule.levels(self._view, NO_MARKS)]
         return found
 
     def reset(self, token: OperatorToken, view: CellView, alarms: Sequence[Violation] = ()) -> ResetDone | ResetRefused:

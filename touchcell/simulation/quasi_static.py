@@ -1,9 +1,10 @@
 """Quasi-static pushing: objects slide on a table under soft tips, without inertia.
 
 An object moves only as far as needed for the tips' forces to come down to what friction with the table can carry. The
-friction is an ellipsoidal limit surface (Goyal, Ruina & Papadopoulos 1991; Howe & Cutkosky 1996): its force is that of
-Coulomb's law, its moment that of a uniform pressure under the whole bottom, and the motion is along its normal, so that
-friction always dissipates. Tips are the springs of ``contact.ContactLaw``, which stick and slip.
+table carries it at nine points, each by Coulomb's law, which resist as an even pressure under the whole bottom does
+(``solids.supports_m``): their limit surface (Goyal, Ruina & Papadopoulos 1991) is not an ellipsoid, and that of oblong
+objects depends on the direction. Motion is along its normal, so that friction always dissipates. Tips are the springs
+of ``contact.ContactLaw``, which stick and slip.
 
 Each step is solved implicitly, like plasticity (a return mapping): nothing creeps below the limit, and no stiffness is
 too large for the step. Objects stay upright and do not collide with each other or with the scene's surfaces; downward
@@ -25,7 +26,7 @@ from touchcell.simulation.contact import ContactLaw, ContactModel
 from touchcell.simulation.objects import GRAVITY_M_S2 as GRAVITY_M_S2
 from touchcell.simulation.objects import FreeObject, TableConfig
 from touchcell.simulation.shapes import Ball
-from touchcell.simulation.solids import friction_radius_m, plain_shape_of
+from touchcell.simulation.solids import friction_radius_m, plain_shape_of, supports_m
 from touchcell.simulation.surfaces import Surface
 from touchcell.simulation.timeline import Restore
 from touchcell.simulation.world import DeferredContact
@@ -34,9 +35,18 @@ _Three = tuple[float, float, float]
 _Matrix = tuple[float, float, float, float, float, float, float, float, float]
 """3 x 3 matrix, by rows."""
 
-_MAX_ITERATIONS: Final = 30
-_TOLERANCE_M: Final = 1e-10
+_STILL: Final[_Three] = (0.0, 0.0, 0.0)
+_MAX_ITERATIONS: Final = 60
 _TOLERANCE: Final = 1e-7
+_REST_M: Final = 1e-10
+"""Motion of a support below which it rests."""
+_SOFTEST_N_M: Final = 1e-3
+"""Stiffness added in Newton's method, where nothing else resists a motion."""
+_LARGEST_M: Final = 0.01
+"""Largest slide that is expected of one step."""
+_SURELY_RESTS: Final = 0.6
+"""Share of the limit, by the ellipsoid through its axes, below which no motion is possible."""
+_REST_CHECKS: Final = 4
 
 
 class _Slider:
@@ -46,6 +56,8 @@ class _Slider:
 
     Attributes:
         x, y, yaw: of the object's centre of mass in the world, m and rad.
+        supports: points of its bottom, over its friction radius.
+        slide: its motion in the last step: x, y and friction radius times yaw, m.
         weight_n: its own weight plus the downward force of tips.
         com_x, com_y: centre of mass from the object's origin, m.
     """
@@ -67,6 +79,8 @@ class _Slider:
         self.shape = plain_shape_of(solid)
         self.surface = Surface(self.shape, self)
         self.radius_m = friction_radius_m(solid)
+        self.supports = tuple((x / self.radius_m, y / self.radius_m) for x, y in supports_m(solid))
+        self.slide: _Three = (0.0, 0.0, 0.0)
         self.friction = body.friction
         gravity = table.gravity_m_s2
         self.own_weight_n = -body.mass_kg * gravity[2]
@@ -98,15 +112,16 @@ class _Slider:
 
     def snapshot(self) -> Restore:
         """Return a function that restores the present state."""
-        kept = self.x, self.y, self.yaw, self.weight_n, self._velocity, self._T
+        kept = self.x, self.y, self.yaw, self.weight_n, self.slide, self._velocity, self._T
 
         def restore() -> None:
-            self.x, self.y, self.yaw, self.weight_n, self._velocity, self._T = kept
+            self.x, self.y, self.yaw, self.weight_n, self.slide, self._velocity, self._T = kept
 
         return restore
 
     def move(self, shift: _Three, dt_s: float) -> None:
         """Move by ``shift``: x, y and friction radius times yaw, m, within ``dt_s``."""
+        self.slide = shift
         dx, dy, turn = shift[0], shift[1], shift[2] / self.radius_m
         self.x, self.y, self.yaw = self.x + dx, self.y + dy, self.yaw + turn
         if dt_s > 0.0:
@@ -203,52 +218,89 @@ class _Tip:
 def _settle(slider: _Slider, tips: Sequence[_Tip], law: ContactLaw) -> _Three:
     """Return the slide of the object under its tips in one step: x, y and friction radius times yaw, m.
 
-    In these coordinates the limit surface is a sphere: the object rests while the force ``f`` on it is below the limit;
-    otherwise it moves along ``f`` until ``f`` has come down to the limit. Newton's method on both conditions,
-    ``shift = way f / limit`` and ``|f| = limit``.
+    It is where the tips' energy and what friction dissipates are least together: the object rests while no motion
+    frees more energy than it dissipates; otherwise it moves until the force on it is the gradient of the dissipation,
+    the sum of the supports' ways. Newton's method, and where that does not come nearer, a step with each support's
+    friction as a damper of its present speed, which always does.
     """
     slider.weight_n = slider.own_weight_n
-    f, K, down = _force(slider, tips, law, (0.0, 0.0, 0.0))
+    first, K, down = _force(slider, tips, law, _STILL)
     slider.weight_n = max(slider.own_weight_n + down, 0.0)
     limit = max(slider.limit_n, 1e-9)
-    size = math.hypot(*f)
-    x = y = turn = way = 0.0
-    if size <= limit:
-        return x, y, turn
+    if math.hypot(*first) <= _SURELY_RESTS * limit:
+        return _STILL
+    shift = slider.slide if any(slider.slide) else _times(_inverse(K, limit / _LARGEST_M), first)
+    if not any(shift):
+        shift = (1e-6, 0.0, 0.0)
+    held, dampers, curvature, _ = _friction(slider, limit, shift)
+    f, K, _ = _force(slider, tips, law, shift)
+    left = (f[0] - held[0], f[1] - held[1], f[2] - held[2])
+    resting = 0
     for _ in range(_MAX_ITERATIONS):
-        fx, fy, ft = f
-        scale, excess = way / limit, size / limit - 1.0
-        unmoved = scale * fx - x, scale * fy - y, scale * ft - turn
-        if abs(excess) < _TOLERANCE and max(map(abs, unmoved)) < _TOLERANCE_M:
-            break
-        inverse = _inverse(scale, K)
-        resting = _times(inverse, unmoved)
-        moving = _times(inverse, (fx / limit, fy / limit, ft / limit))
-        per_n = size * limit
-        falls = (
-            (fx * K[0] + fy * K[3] + ft * K[6]) / per_n,
-            (fx * K[1] + fy * K[4] + ft * K[7]) / per_n,
-            (fx * K[2] + fy * K[5] + ft * K[8]) / per_n,
-        )
-        further = (excess - _dot(falls, resting)) / _dot(falls, moving)
-        part = 1.0
-        while True:
-            trial = (
-                x + part * (resting[0] + further * moving[0]),
-                y + part * (resting[1] + further * moving[1]),
-                turn + part * (resting[2] + further * moving[2]),
-            )
-            f, K, _ = _force(slider, tips, law, trial)
-            size = math.hypot(*f)
-            # A step that breaks the contact is too long: there the force has no direction.
-            if size > 0.1 * limit or part < 1e-3:
-                break
-            part *= 0.5
-        x, y, turn = trial
-        way = max(way + part * further, 0.0)
-        if size == 0.0:
-            break
-    return x, y, turn
+        size = math.hypot(*left)
+        if size < _TOLERANCE * limit:
+            return shift
+        further = _times(_inverse(_sum(K, curvature), _SOFTEST_N_M), left)
+        trial = (shift[0] + further[0], shift[1] + further[1], shift[2] + further[2])
+        next_held, next_dampers, next_curvature, next_dissipated = _friction(slider, limit, trial)
+        next_f, next_K, _ = _force(slider, tips, law, trial)
+        next_left = (next_f[0] - next_held[0], next_f[1] - next_held[1], next_f[2] - next_held[2])
+        if math.hypot(*next_left) > 0.9 * size:
+            pulled = _times(K, shift)
+            trial = _times(_inverse(_sum(K, dampers)), (f[0] + pulled[0], f[1] + pulled[1], f[2] + pulled[2]))
+            next_held, next_dampers, next_curvature, next_dissipated = _friction(slider, limit, trial)
+            next_f, next_K, _ = _force(slider, tips, law, trial)
+            next_left = (next_f[0] - next_held[0], next_f[1] - next_held[1], next_f[2] - next_held[2])
+            resting = resting + 1 if _dot(first, trial) < next_dissipated else 0
+            if resting >= _REST_CHECKS or math.hypot(*trial) < _REST_M:
+                return _STILL
+        shift, f, K, left = trial, next_f, next_K, next_left
+        dampers, curvature = next_dampers, next_curvature
+    return shift
+
+
+def _friction(slider: _Slider, limit_n: float, shift: _Three) -> tuple[_Three, _Matrix, _Matrix, float]:
+    """Return the table's force against a slide, in the slide's coordinates; the same as dampers, and its growth with
+    the slide, N/m; and the energy that the slide dissipates, J."""
+    x, y, turn = shift
+    sin, cos = math.sin(slider.yaw), math.cos(slider.yaw)
+    each_n = limit_n / len(slider.supports)
+    fx = fy = ft = way = 0.0
+    dd = dxt = dyt = dtt = 0.0
+    xx = xy = yy = xt = yt = tt = 0.0
+    for px, py in slider.supports:
+        rx, ry = cos * px - sin * py, sin * px + cos * py
+        vx, vy = x - turn * ry, y + turn * rx
+        speed = math.sqrt(vx * vx + vy * vy + _REST_M * _REST_M)
+        ux, uy, damper = vx / speed, vy / speed, each_n / speed
+        lever = rx * uy - ry * ux
+        way += speed
+        fx, fy, ft = fx + ux, fy + uy, ft + lever
+        dd, dxt, dyt, dtt = dd + damper, dxt - damper * ry, dyt + damper * rx, dtt + damper * (rx * rx + ry * ry)
+        # Only motion across its own direction turns a support's friction.
+        xx, xy, yy = xx + damper * (1.0 - ux * ux), xy - damper * ux * uy, yy + damper * (1.0 - uy * uy)
+        xt, yt = xt + damper * (-ry - ux * lever), yt + damper * (rx - uy * lever)
+        tt += damper * (rx * rx + ry * ry - lever * lever)
+    return (
+        (each_n * fx, each_n * fy, each_n * ft),
+        (dd, 0.0, dxt, 0.0, dd, dyt, dxt, dyt, dtt),
+        (xx, xy, xt, xy, yy, yt, xt, yt, tt),
+        each_n * way,
+    )
+
+
+def _sum(a: _Matrix, b: _Matrix) -> _Matrix:
+    return (
+        a[0] + b[0],
+        a[1] + b[1],
+        a[2] + b[2],
+        a[3] + b[3],
+        a[4] + b[4],
+        a[5] + b[5],
+        a[6] + b[6],
+        a[7] + b[7],
+        a[8] + b[8],
+    )
 
 
 def _dot(a: _Three, b: _Three) -> float:
@@ -261,12 +313,10 @@ def _times(M: _Matrix, v: _Three) -> _Three:
     return a * x + b * y + c * z, d * x + e * y + f * z, g * x + h * y + i * z
 
 
-def _inverse(scale: float, K: _Matrix) -> _Matrix:
-    """Return the inverse of the matrix 1 + scale K."""
+def _inverse(K: _Matrix, added: float = 0.0) -> _Matrix:
+    """Return the inverse of a matrix, with ``added`` on its diagonal."""
     a, b, c, d, e, f, g, h, i = K
-    a, b, c = 1.0 + scale * a, scale * b, scale * c
-    d, e, f = scale * d, 1.0 + scale * e, scale * f
-    g, h, i = scale * g, scale * h, 1.0 + scale * i
+    a, e, i = a + added, e + added, i + added
     p, q, r = e * i - f * h, f * g - d * i, d * h - e * g
     over = 1.0 / (a * p + b * q + c * r)
     return (

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +43,12 @@ class Variation:
     missing: float = 0.003
     field: float = 0.0
     slip: float = 0.0
+
+
+USUAL_VARIATION: Final = Variation(
+    parameters=0.01, turn_rad=0.002, shift_px=0.3, marker_px=0.1, disc_radius=0.03, missing=0.002
+)
+"""What the simulated models that ship were trained on, and are judged on."""
 
 
 @dataclass(frozen=True, slots=True)

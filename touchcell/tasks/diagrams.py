@@ -23,7 +23,9 @@ _BLOCK: Final = re.compile(r"(<!-- diagram: (\w+) -->\n).*?(<!-- end of diagram 
 def tables() -> Mapping[str, Table]:
     """Return the tables that are drawn, by the name in their markers."""
     return {
-        "servoing": servo_table("servoing", SurfaceFollowingConfig(), run_timeout_s=1.0, sidesteps=True),
+        "servoing": servo_table(
+            "servoing", SurfaceFollowingConfig(), run_timeout_s=1.0, sidesteps=True, needs_feature=True
+        ),
         "data_collection": collect_table(DataCollectionConfig()),
         "observe": observe_table(ObserveConfig()),
         "jog": jog_table(JogConfig()),

@@ -105,7 +105,13 @@ class ServoState(Enum):
 
 
 def servo_table(
-    task: str, config: ServoConfig, run_timeout_s: float, *, sidesteps: bool = False, servos: int = 1
+    task: str,
+    config: ServoConfig,
+    run_timeout_s: float,
+    *,
+    sidesteps: bool = False,
+    servos: int = 1,
+    needs_feature: bool = False,
 ) -> Table:
     """Return the states and transitions of a servoing task; motions time out after twice their nominal duration.
 
@@ -115,6 +121,7 @@ def servo_table(
         run_timeout_s: longest time in ``run``.
         sidesteps: whether a contact may be given up for another beside it.
         servos: number of sensors, which are checked one after another.
+        needs_feature: whether a contact may turn out to be of another feature than the behavior is for.
     """
     s = ServoState
     approach_s = 2.0 * config.approach_distance_mm / config.approach_speed_mm_s + 1.0
@@ -146,15 +153,14 @@ def servo_table(
             TransitionDef("contact", s.APPROACH, s.SETTLE),
             TransitionDef("no_contact", s.APPROACH, s.RETRACT),
             TransitionDef("agrees", s.CHECK, s.SETTLE),
-            TransitionDef("missed", s.CHECK, s.RETRACT),
             TransitionDef("lost", s.CHECK, s.APPROACH, guard="may_reapproach"),
             TransitionDef("lost", s.CHECK, s.RETRACT),
             TransitionDef("settled", s.SETTLE, s.RUN),
-            TransitionDef("missed", s.SETTLE, s.RETRACT),
             TransitionDef("lost", s.SETTLE, s.APPROACH, guard="may_reapproach"),
             TransitionDef("lost", s.SETTLE, s.RETRACT),
             TransitionDef("finished", s.RUN, s.RETRACT),
             TransitionDef("missed", s.RUN, s.RETRACT),
+            *(TransitionDef("missed", state, s.RETRACT) for state in (s.CHECK, s.SETTLE) if needs_feature),
             TransitionDef("lost", s.RUN, s.RETURN, guard="may_return"),
             *(
                 (TransitionDef("aside", s.RUN, s.SIDESTEP), TransitionDef("placed", s.SIDESTEP, s.APPROACH))
@@ -204,7 +210,11 @@ class ServoTask(MachineTask):
         self._servos = servos
         timeout_s = min(servo.run.timeout_s for servo in servos)
         sidesteps = any(isinstance(servo.run, Sidestepping) and servo.run.may_sidestep for servo in servos)
-        self._machine = TaskMachine(servo_table(name, config, timeout_s, sidesteps=sidesteps, servos=len(servos)), self)
+        needs_feature = any(isinstance(servo.run, NeedsFeature) for servo in servos)
+        table = servo_table(
+            name, config, timeout_s, sidesteps=sidesteps, servos=len(servos), needs_feature=needs_feature
+        )
+        self._machine = TaskMachine(table, self)
         self._checks: list[SensorCheck] = []
         self._unchecked = config.check_s > 0.0
         self._now_ns = 0

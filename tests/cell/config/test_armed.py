@@ -18,6 +18,7 @@ from touchcell.cell.config.schema import plan_cell
 from touchcell.cell.config.yaml_file import InvalidCell
 from touchcell.control.interlocks.config import build_interlocks
 from touchcell.control.interlocks.planning_scene import PlanningScene
+from touchcell.drivers.core.protocols import TwistSink
 from touchcell.errors import ConfigError
 from touchcell.paths import CONFIGS
 
@@ -566,3 +567,16 @@ def test_the_proofs_of_a_plan_are_those_of_its_own_interlocks(tmp_path: Path) ->
     with pytest.raises(ValueError, match="shorter"):
         prove_cell(plan, cell_facts(plan), ())
     assert isinstance(cell_facts(plan).scene, PlanningScene)
+
+
+@pytest.mark.parametrize(
+    "cell", sorted(path.name for path in {*CONFIGS.glob("*_sim.yaml"), *CONFIGS.glob("*_bench.yaml")})
+)
+def test_every_shipped_cell_that_moves_by_images_trips_on_frozen_and_badly_exposed_ones(cell: str) -> None:
+    plan = plan_cell(CONFIGS / cell, to_run=False)
+    by_images = any(each.estimator.kind in ("network", "edge_network") for each in plan.cell.sensors.values())
+    moving = [each for each in plan.arms.values() if TwistSink in each.spec.capabilities.provides]
+    if not by_images or not moving:
+        return
+    kinds = {each.kind for each in plan.cell.interlocks.values()}
+    assert kinds >= {"frame_frozen", "exposure"}

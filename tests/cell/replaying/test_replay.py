@@ -111,6 +111,17 @@ def test_only_what_came_before_a_reset_is_replayed(tmp_path: Path) -> None:
     assert [cycle.task_state for cycle in found.cycles] == ["run", "tripped"]
 
 
+@pytest.mark.parametrize(
+    ("topic", "form", "lossy"), [("image", "png", False), ("image", "jpeg", True), ("video", "h264", True)]
+)
+def test_images_that_the_recording_has_changed_are_known(topic: str, form: str, lossy: bool, tmp_path: Path) -> None:
+    file = tmp_path / RECORDING
+    with Recorder(file) as recorder:
+        recorder.write(f"/sensors/sensor/{topic}", 1, {"format": form})
+        recorder.write("/task", 2, {"state": "run"})
+    assert read_run(file).lossy is lossy
+
+
 def test_the_command_says_what_differs_and_draws_it(
     with_images: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from touchcell.cell.bench.provenance import provenance
-from touchcell.cell.cli.train_kinds import confusion_table, drawn
+from touchcell.cell.trainings.feature_kinds import confusion_table, drawn
 from touchcell.geometry.types import Array
 from touchcell.paths import CLASSIFIERS
 from touchcell.perception.features.feature_model import CLASSES, FeatureModel, load_feature_model

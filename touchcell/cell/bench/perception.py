@@ -39,7 +39,7 @@ from touchcell.perception.models.model_file import Header, load_model
 from touchcell.perception.networks.figures import write_predictions
 from touchcell.perception.networks.scores import SCORE_NAMES, Scores
 from touchcell.simulation.render import FrameRenderer, Lighting
-from touchcell.simulation.samples import Variation, contacts
+from touchcell.simulation.samples import USUAL_VARIATION, contacts
 
 SHIPPED = MODELS / "sim_gdn.safetensors"
 _PARTS = {
@@ -49,8 +49,6 @@ _PARTS = {
     "camera": "the timed frames: images pasted back into camera frames, where they were cropped",
 }
 PROBABILITIES = tuple(np.linspace(0.05, 0.95, 19).round(2).tolist())
-# Sensors vary as little as those that the shipped model was trained on.
-_VARIATION = Variation(parameters=0.01, turn_rad=0.002, shift_px=0.3, marker_px=0.1, disc_radius=0.03, missing=0.002)
 
 
 def run(arguments: Sequence[str], out: Path) -> None:
@@ -243,7 +241,7 @@ def write_simulated(folder: Path, images: int, seed: int = 0) -> None:
     with (folder / LABEL_FILES[0]).open("w", newline="") as stream:
         rows = csv.writer(stream)
         rows.writerow([IMAGE_COLUMN, *LABEL_COLUMNS])
-        for i, contact in enumerate(contacts(images, seed, variation=_VARIATION)):
+        for i, contact in enumerate(contacts(images, seed, variation=USUAL_VARIATION)):
             name = f"image_{i + 1}.png"
             cv2.imwrite(str(folder / IMAGE_FOLDER / name), renderer.raw(contact.pixels, i))
             rows.writerow([name, *se3.to_euler_mm_deg(contact.T_f_s).tolist()])

@@ -200,7 +200,7 @@ def _train_many(options: argparse.Namespace, settings: dict[str, object]) -> int
 
 def _train_sim(options: argparse.Namespace) -> int:
     if options.feature == "kinds":
-        from touchcell.cell.cli.train_kinds import train_kinds
+        from touchcell.cell.trainings.feature_kinds import train_kinds
 
         print(train_kinds(options.out, samples=options.samples, epochs=options.epochs, seed=options.seed))
         return EXIT_OK

@@ -13,7 +13,7 @@ from touchcell.progress import shown_progress
 PLOT = "replay.png"
 """Name of the plot in the folder of a replay."""
 _TWIST = 5.0
-_TWIST_OF_VIDEO = 10.0
+_TWIST_OF_LOSSY = 10.0
 
 
 def add_parser(commands: Subparsers) -> None:
@@ -38,8 +38,8 @@ def add_parser(commands: Subparsers) -> None:
         "--tolerance-twist",
         type=float,
         metavar="MM_S",
-        help=f"largest difference of twists, mm/s and deg/s (default: {_TWIST:g}; {_TWIST_OF_VIDEO:g} for images that "
-        "were recorded as video)",
+        help=f"largest difference of twists, mm/s and deg/s (default: {_TWIST:g}; {_TWIST_OF_LOSSY:g} for images that "
+        "were recorded as video or JPEG)",
     )
 
 
@@ -62,7 +62,7 @@ def _replay(options: argparse.Namespace) -> int:
             )
         twist = options.tolerance_twist
         if twist is None:
-            twist = _TWIST_OF_VIDEO if done.recorded.lossy else _TWIST
+            twist = _TWIST_OF_LOSSY if done.recorded.lossy else _TWIST
         found = differences(done, Tolerance(options.tolerance, twist))
         plot = plot_replay(done, found, out / PLOT)
     for note in done.notes:

@@ -28,7 +28,7 @@ from touchcell.perception.networks.training import Settings, train_on_arrays
 from touchcell.perception.runtime.estimator_spec import Feature
 from touchcell.simulation.edge_samples import edge_contacts
 from touchcell.simulation.render import FrameRenderer
-from touchcell.simulation.samples import SampledContact, Variation, contacts
+from touchcell.simulation.samples import USUAL_VARIATION, SampledContact, Variation, contacts
 from touchcell.simulation.shape_samples import shape_contacts
 from touchcell.simulation.tip import Tip, TipParameters
 from touchcell.simulation.tip_file import TipFile, load_tip
@@ -58,9 +58,6 @@ ARCHITECTURE = Architecture(
 
 # From the first touch to beyond the depth at which objects are tracked, so that neither is outside the training range.
 DEPTH_MM = (0.0, 6.5)
-
-VARIATION = Variation(parameters=0.01, turn_rad=0.002, shift_px=0.3, marker_px=0.1, disc_radius=0.03, missing=0.002)
-
 
 FITTED_VARIATION = Variation(
     parameters=0.002,
@@ -127,11 +124,11 @@ class Imagined:
     def contacts(self, samples: int, seed: int) -> Iterator[SampledContact]:
         """Random ones."""
         if self.feature == "edge":
-            return edge_contacts(samples, seed, variation=VARIATION)
+            return edge_contacts(samples, seed, variation=USUAL_VARIATION)
         if self.feels == "shape":
-            return shape_contacts(samples, seed, depth_mm=DEPTH_MM, variation=VARIATION)
+            return shape_contacts(samples, seed, depth_mm=DEPTH_MM, variation=USUAL_VARIATION)
         if self.sensor is None:
-            return contacts(samples, seed, depth_mm=DEPTH_MM, variation=VARIATION)
+            return contacts(samples, seed, depth_mm=DEPTH_MM, variation=USUAL_VARIATION)
         sensor = self.sensor
         return contacts(
             samples, seed, depth_mm=DEPTH_MM, parameters=sensor.tip, rig=sensor.rig, variation=FITTED_VARIATION

@@ -13,7 +13,6 @@ import numpy as np
 
 from touchcell.cell.analysis.html_page import plotly_graphs, write_page
 from touchcell.cell.errors import RecordingError
-from touchcell.cell.experiments.runner import ExperimentSpec, table_rows
 from touchcell.cell.experiments.table import Column
 from touchcell.cell.experiments.trials import Finished
 from touchcell.geometry.types import Array
@@ -23,12 +22,18 @@ _MOST_POINTS: Final = 300
 
 
 def write_experiment_html(
-    experiment: ExperimentSpec, finished: Sequence[Finished], text: str, pictures: Sequence[Path], folder: Path
+    title: str,
+    shown: Sequence[Column],
+    finished: Sequence[Finished],
+    text: str,
+    pictures: Sequence[Path],
+    folder: Path,
 ) -> Path:
     """Write ``report.html``: the table, each measure trial by trial, the paths of the tools, and the figures.
 
     Args:
-        experiment: its spec.
+        title: of the page.
+        shown: columns of the table.
         finished: its trials.
         text: of its table.
         pictures: its figures.
@@ -41,7 +46,7 @@ def write_experiment_html(
     go = plotly_graphs()
     # A table may show mean and worst of the same measure; here each trial has a point.
     columns: dict[str, Column] = {}
-    for column in experiment.columns:
+    for column in shown:
         first = columns.setdefault(column.measure, column)
         columns[column.measure] = replace(first, below=first.below if column.below is None else column.below)
     figures = [
@@ -51,20 +56,20 @@ def write_experiment_html(
     ]
     if paths := list(_paths(finished)):
         figures.append(("Where the tools went", _paths_figure(go, paths)))
-    after = [_trials_table(experiment, finished), *map(_inlined, pictures)]
-    return write_page(folder, f"{experiment.name}: {experiment.summary}", text, figures, after)
+    after = [_trials_table(shown, finished), *map(_inlined, pictures)]
+    return write_page(folder, title, text, figures, after)
 
 
 def _measure_figure(go: Any, column: Column, finished: Sequence[Finished]) -> Any:
     """Return one measure with a point for each trial, by row of the table."""
     figure = go.Figure()
-    for row in table_rows(finished):
-        mine = [each for each in finished if each.trial.row == row.name]
+    for row in dict.fromkeys(each.trial.row for each in finished):
+        mine = [each for each in finished if each.trial.row == row]
         values = [each.measures.get(column.measure, np.nan) for each in mine]
         figure.add_trace(
             go.Box(
                 x=values,
-                name=row.name,
+                name=row,
                 text=[f"{each.trial.name}: {each.outcome}" for each in mine],
                 boxpoints="all",
                 jitter=0.4,
@@ -134,9 +139,8 @@ def _paths_figure(go: Any, paths: Sequence[tuple[Finished, str, Array]]) -> Any:
     return figure
 
 
-def _trials_table(experiment: ExperimentSpec, finished: Sequence[Finished]) -> str:
+def _trials_table(columns: Sequence[Column], finished: Sequence[Finished]) -> str:
     """Return every trial with its outcome, its measures and its run folder."""
-    columns = experiment.columns
     head = "".join(f"<th>{html.escape(title)}</th>" for title in ("trial", "outcome", *(c.title for c in columns)))
     rows = []
     for each in finished:

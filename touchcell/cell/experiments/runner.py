@@ -105,8 +105,8 @@ def run_experiment(
     finished = perform_all(
         perform, experiment.trials(scale), workers=workers, executor=executor, live=live, title=experiment.name
     )
-    rows = table_rows(finished)
-    text = table(f"{experiment.name}: {experiment.summary}", rows, experiment.columns, experiment.paper)
+    rows, title = table_rows(finished), f"{experiment.name}: {experiment.summary}"
+    text = table(title, rows, experiment.columns, experiment.paper)
     pictures = [] if any(each.broken for each in finished) else experiment.draw(finished, folder)
     lines = [
         text,
@@ -118,9 +118,11 @@ def run_experiment(
     ]
     whole = "\n".join(lines)
     if as_html:
+        # plotly is an extra.
         from touchcell.cell.experiments.html_report import write_experiment_html
 
-        whole += f"\n  {write_experiment_html(experiment, finished, whole, pictures, folder).name}"
+        page = write_experiment_html(title, experiment.columns, finished, whole, pictures, folder)
+        whole += f"\n  {page.name}"
     (folder / "summary.txt").write_text(whole + "\n")
     (folder / "summary.json").write_text(json.dumps(_summary(experiment, scale, rows, finished), indent=1) + "\n")
     return TrialsResult(whole, tuple(finished))

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from foxglove import Context
     from foxglove._foxglove_py import BaseChannel
 
-CHUNK_BYTES: Final = 16 * 1024
-"""A kill loses at most the open chunk: a fraction of a second of a cell's usual 100 kB/s."""
+CHUNK_BYTES: Final = 10 * 1024
+"""A kill loses at most the open chunk: fewer than 200 messages, a fraction of a second at a cell's usual 100 kB/s."""
 
 
 LOOPBACK: Final = "127.0.0.1"

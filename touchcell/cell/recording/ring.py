@@ -30,7 +30,10 @@ _MAGIC: Final = b"tchring2"
 _MAGIC_OF_JSON: Final = b"tchring1"
 _HEAD: Final = struct.Struct("<8sIIII")
 _HEAD_BYTES: Final = 4096
+_CHECK: Final = struct.Struct("<I")
+_BODY: Final = struct.Struct("<IQqH")
 _RECORD: Final = struct.Struct("<IIQqH")
+"""A check of what follows, and the head of that."""
 _TYPE: Final = struct.Struct("<IHI")
 _TYPES_BYTES: Final = 256 * 1024
 _NUMBER: Final = struct.Struct("<H")
@@ -59,6 +62,7 @@ class RingWriter:
         self._types: list[MessageType] = []
         self._numbers: dict[int, int] = {}
         self._types_at = 0
+        self._topics: dict[str, bytes] = {}
         self._failed = False
         try:
             if path is None:
@@ -84,7 +88,9 @@ class RingWriter:
 
     def add(self, topic: str, t_ns: int, message: Encoded) -> None:
         """Append one message; one that is longer than a segment, or comes after a failure, is left out."""
-        name = topic.encode()[:_LONGEST_TOPIC]
+        name = self._topics.get(topic)
+        if name is None:
+            name = self._topics[topic] = topic.encode()[:_LONGEST_TOPIC]
         length = len(name) + _NUMBER.size + len(message.data)
         whole = _RECORD.size + length
         if self._failed or whole > self._segment_bytes:
@@ -97,11 +103,15 @@ class RingWriter:
         if self._at + whole > self._segment_bytes:
             self._segment, self._at = (self._segment + 1) % _SEGMENTS, 0
         self._number += 1
-        head = _RECORD.pack(0, length, self._number, t_ns, len(name))[4:]
-        body = head + name + _NUMBER.pack(type_number) + message.data
-        record = zlib.crc32(body).to_bytes(4, "little") + body
+        body = b"".join(
+            (_BODY.pack(length, self._number, t_ns, len(name)), name, _NUMBER.pack(type_number), message.data)
+        )
         try:
-            os.pwrite(self._fd, record, _SEGMENTS_AT + self._segment * self._segment_bytes + self._at)
+            os.pwrite(
+                self._fd,
+                _CHECK.pack(zlib.crc32(body)) + body,
+                _SEGMENTS_AT + self._segment * self._segment_bytes + self._at,
+            )
         except OSError:
             self._failed = True
         self._at += whole

@@ -37,8 +37,8 @@ from touchcell.perception.runtime.estimate import ContactEstimate
 
 SCENE_TOPIC: Final = "/scene"
 LOG_TOPIC: Final = "/log"
-# Joints, links and moved surfaces are for the eye, which sees no more pictures a second.
-_PICTURE_S: Final = 1.0 / 30.0
+_PICTURE_NS: Final = round(1e9 / 30.0)
+"""What is drawn is for the eye, which sees no more pictures a second; the numbers are recorded in every cycle."""
 _AGAIN_NS: Final = 1_000_000_000
 _LEVELS: Final[dict[Severity, str]] = {Severity.LIMIT: "WARNING", Severity.TRIP: "ERROR", Severity.FAULT: "FATAL"}
 
@@ -59,8 +59,7 @@ class ViewerRecord:
         self._transforms: dict[str, tuple[str, TransformMessage]] = {}
         self._beliefs: dict[str, tuple[str, BeliefMessage]] = {}
         self._joints = {role: JointMessage(chain.joint_names) for role, chain in scene.chains.items()}
-        self._joints_ns: dict[str, int] = {}
-        self._moving_ns = self._begun_ns = -(1 << 62)
+        self._next_ns = self._begun_ns = -(1 << 62)
 
     def begin(self, t_ns: int) -> None:
         """Write what stands still, and everything that is drawn."""
@@ -75,17 +74,19 @@ class ViewerRecord:
         message = scene_message(t_ns + self._recorder.wall_offset_ns, entities)
         self._recorder.write_bytes(SCENE_TOPIC, t_ns, SCENE_UPDATE, message)
 
+    def is_due(self, t_ns: int) -> bool:
+        """Return whether it is time for the next picture, which counts from there."""
+        if t_ns < self._next_ns:
+            return False
+        self._next_ns = max(self._next_ns, t_ns - _PICTURE_NS) + _PICTURE_NS
+        return True
+
     def arm(self, role: str, state: Stamped[TcpState]) -> None:
         """Write where an arm's tool is."""
         self._transform(base_frame(role), tcp_frame(role), state.t_ns, state.value.T_base_tcp)
 
-    def wants_joints(self, role: str, t_ns: int) -> bool:
-        """Return whether it is time to write an arm's joints again."""
-        return t_ns >= self._joints_ns.get(role, t_ns)
-
     def joints(self, role: str, state: Stamped[JointState]) -> None:
         """Write the states of an arm's joints, and where its links are."""
-        self._joints_ns[role] = state.t_ns + round(1e9 * _PICTURE_S)
         t_wall_ns = state.t_ns + self._recorder.wall_offset_ns
         message = self._joints[role].encode(t_wall_ns, state.value.q, state.value.dq, state.value.tau)
         self._recorder.write_bytes(f"/arms/{role}/joints", state.t_ns, JOINT_STATES, message)
@@ -122,9 +123,6 @@ class ViewerRecord:
 
     def moving(self, t_ns: int) -> None:
         """Write where the surfaces are that a prescribed motion moves."""
-        if t_ns < self._moving_ns:
-            return
-        self._moving_ns = t_ns + round(1e9 * _PICTURE_S)
         for frame in self._scene.moving:
             self._transform(WORLD, frame.name, t_ns, frame.pose((t_ns - self._scene_start_ns) * 1e-9))
 

@@ -65,7 +65,7 @@ class RecordedRun:
         cycles: until the task ended, or until an operator let it start again.
         with_images: roles of the sensors whose images were recorded.
         resumed: whether the run went on after a reset, which is not part of ``cycles``.
-        lossy: whether images were recorded as video, which changes them a little.
+        lossy: whether images were recorded as video or JPEG, which changes them a little.
     """
 
     file: Path
@@ -135,9 +135,9 @@ class _CycleReader:
                 cycle.contacts[role] = data
             case ["sensors", role, "measurement"]:
                 cycle.measurements[role] = data
-            case ["sensors", role, kind] if is_image(message.topic):
+            case ["sensors", role, _] if is_image(message.topic):
                 self.with_images.add(role)
-                self.lossy = self.lossy or kind == "video"
+                self.lossy = self.lossy or data.get("format") != "png"
             case ["devices", role, "reading"]:
                 values = {key: value for key, value in data.items() if key != "seq"}
                 cycle.readings[role] = Stamped(values, t_ns, int(data.get("seq", 0)))

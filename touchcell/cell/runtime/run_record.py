@@ -232,12 +232,12 @@ class RunRecord:
         }
 
     def _draw(self, viewers: ViewerRecord, reading: Reading, objects: Stamped[Mapping[str, Array]] | None) -> None:
-        """Record for viewers where everything is."""
+        """Record for viewers where everything is, as often as they show it."""
+        if not viewers.is_due(reading.now_ns):
+            return
         for role, state in reading.states.items():
             viewers.arm(role, state)
         for role, arm in self._jointed.items():
-            if not viewers.wants_joints(role, reading.now_ns):
-                continue
             try:
                 joints = arm.joints()
             except DeviceError:

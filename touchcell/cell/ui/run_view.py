@@ -98,7 +98,9 @@ class Moment:
 
 def sources(folder: Path) -> list[str]:
     """Return the files of a run that can be shown: its recording, its black boxes, and the ring that a crash leaves."""
-    boxes = [*sorted(folder.glob("blackbox-*.mcap")), folder / MESSAGES, folder / RING]
+    boxes = [*sorted(folder.glob("blackbox-*.mcap")), folder / MESSAGES]
+    if not is_running(folder):
+        boxes.append(folder / RING)
     return [path.name for path in (folder / RECORDING, *boxes) if path.is_file()]
 
 

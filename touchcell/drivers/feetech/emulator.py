@@ -264,6 +264,7 @@ class FeetechArm(Emulator):
             servo.put(Register.PROTECTION_TIME, bytes([round(self._protection_time_s * 100)]))
         self._buffer = b""
         self._held_back: dict[int, bytes] = {}
+        self._rivals: dict[int, Servo] = {}
         self._stepped_s: float | None = None
         self._energising = 0
         self._commands = 0
@@ -407,12 +408,16 @@ class FeetechArm(Emulator):
 
     def _on_packet(self, packet: Packet) -> None:
         data = packet.data
-        listening = {servo.number: servo for index, servo in enumerate(self.servos) if self._hears(index)}
+        hearing = [servo for index, servo in enumerate(self.servos) if self._hears(index)]
+        listening = {servo.number: servo for servo in hearing}
+        # Servos that were given one id both obey, and reply at once.
+        self._rivals = {s.number: r for s in hearing for r in hearing if r is not s and r.number == s.number}
         if "id_clash" in self.active:
             first, second = (self.servos[index] for index in self.active["id_clash"])
             listening.pop(second.number, None)
             if first.number in listening:
                 listening[first.number] = first
+                self._rivals[first.number] = second
         addressed = [s for n, s in listening.items() if packet.servo in (n, codec.BROADCAST_ID)]
         alone = packet.servo != codec.BROADCAST_ID
         if packet.code == Instruction.PING:
@@ -422,7 +427,8 @@ class FeetechArm(Emulator):
         elif packet.code in (Instruction.WRITE, Instruction.REG_WRITE) and data:
             for servo in addressed:
                 if packet.code == Instruction.WRITE:
-                    self._write(servo, data[0], data[1:])
+                    for twin in [each for each in hearing if each.number == servo.number]:
+                        self._write(twin, data[0], data[1:])
                 else:
                     servo.prepared = (data[0], data[1:])
             self._answer([(servo, b"") for servo in addressed if alone and servo.acknowledges])
@@ -464,8 +470,8 @@ class FeetechArm(Emulator):
             if self.spend("drop"):
                 continue
             packet = codec.encode(self._spoilt(Packet(servo.number, servo.status, data)))
-            if "id_clash" in self.active:
-                packet = self._collided(servo, packet, data)
+            if servo.number in self._rivals:
+                packet = self._collided(servo, self._rivals[servo.number], packet, data)
             if self.spend("noise"):
                 packet = _STRAY + packet
             if self.spend("corrupt"):
@@ -481,12 +487,9 @@ class FeetechArm(Emulator):
             else:
                 self._line.write(packet)
 
-    def _collided(self, servo: Servo, packet: bytes, data: bytes) -> bytes:
+    @staticmethod
+    def _collided(servo: Servo, rival: Servo, packet: bytes, data: bytes) -> bytes:
         """Return what the host hears when the other servo of the same id replies at once: its zeros pull the line."""
-        first, second = self.active["id_clash"]
-        if servo is not self.servos[first]:
-            return packet
-        rival = self.servos[second]
         # Another servo stands elsewhere, and its oscillator is never quite in step.
         other = codec.encode(Packet(servo.number, rival.status, bytes(~byte & 0xFF for byte in data)))
         return bytes(a & b for a, b in zip(packet, other[1:] + other[:1], strict=True))

@@ -209,38 +209,10 @@ class SerialChain:
     def accelerate(self) -> bool:
         """Compute by pinocchio from now on, where it is installed; return whether it is. Takes a moment."""
         with suppress(ImportError):
-            self._engine = self._engine or PinocchioEngine(self)
+            self._engine = self._engine or PinocchioEngine(
+                self._fixed, self._axes, self._mass, self._com, self._T_joint_tcp, self._gravity
+            )
         return self._engine is not None
-
-    @property
-    def axes(self) -> Array:
-        """Unit axes (n, 3) of the joints in their frames."""
-        return self._axes
-
-    @property
-    def placements(self) -> Array:
-        """Poses (n, 4, 4) of the joint frames in the link before, at zero."""
-        return self._fixed
-
-    @property
-    def masses(self) -> Array:
-        """Masses (n,) kg that each joint moves, without those beyond the next; the tool is part of the last."""
-        return self._mass
-
-    @property
-    def centres(self) -> Array:
-        """Centres of these masses (n, 3) m in the joint frames."""
-        return self._com
-
-    @property
-    def T_joint_tcp(self) -> Array:  # noqa: N802
-        """Pose (4, 4) of the tool centre point in the last joint's frame."""
-        return self._T_joint_tcp
-
-    @property
-    def gravity_m_s2(self) -> Array:
-        """Acceleration (3,) of free fall along base axes."""
-        return self._gravity
 
     @property
     def joint_count(self) -> int:

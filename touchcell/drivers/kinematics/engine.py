@@ -4,44 +4,55 @@ from __future__ import annotations
 
 import math
 import threading
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from touchcell.geometry.types import Array
 
-if TYPE_CHECKING:
-    from touchcell.drivers.kinematics.chain import SerialChain
-
 
 class PinocchioEngine:
-    """Forward kinematics, Jacobian and gravity torques of one chain with its tool.
+    """Forward kinematics, Jacobian and gravity torques of one chain of turning joints with its tool.
 
     Args:
-        chain: the chain.
+        placements: (n, 4, 4) of the joint frames in the link before, at zero.
+        axes: (n, 3) unit axes in the joint frames.
+        masses: (n,) kg that each joint moves, without those beyond the next.
+        centres: (n, 3) m centres of these masses in the joint frames.
+        T_joint_tcp: (4, 4) tool centre point in the last joint's frame.
+        gravity_m_s2: (3,) along base axes.
 
     Raises:
         ImportError: pinocchio is not installed.
     """
 
-    def __init__(self, chain: SerialChain) -> None:
+    def __init__(
+        self,
+        placements: Array,
+        axes: Array,
+        masses: Array,
+        centres: Array,
+        T_joint_tcp: Array,
+        gravity_m_s2: Array,
+    ) -> None:
         import pinocchio as pin
 
         self._pin = pin
         model = pin.Model()
         parent = 0
-        for i, (T, axis) in enumerate(zip(chain.placements, chain.axes, strict=True)):
+        for i, (T, axis) in enumerate(zip(placements, axes, strict=True)):
             joint = pin.JointModelRevoluteUnaligned(*axis.tolist())
             parent = model.addJoint(parent, joint, pin.SE3(T[:3, :3], T[:3, 3]), f"joint{i}")
-            inertia = pin.Inertia(float(chain.masses[i]), chain.centres[i], np.zeros((3, 3)))
+            inertia = pin.Inertia(float(masses[i]), centres[i], np.zeros((3, 3)))
             model.appendBodyToJoint(parent, inertia, pin.SE3.Identity())
-        T = chain.T_joint_tcp
-        self._frame = model.addFrame(pin.Frame("tcp", parent, pin.SE3(T[:3, :3], T[:3, 3]), pin.FrameType.OP_FRAME))
-        model.gravity.linear = chain.gravity_m_s2
+        self._frame = model.addFrame(
+            pin.Frame("tcp", parent, pin.SE3(T_joint_tcp[:3, :3], T_joint_tcp[:3, 3]), pin.FrameType.OP_FRAME)
+        )
+        model.gravity.linear = gravity_m_s2
         self._model = model
         # Pinocchio computes in place: the thread of a bus and those that ask for its state each need a place.
         self._places = threading.local()
-        self._count = len(chain.axes)
+        self._count = len(axes)
 
     @property
     def _data(self) -> Any:

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from touchcell.cell.cli.train_sim import VARIATION
 from touchcell.geometry.types import Array
 from touchcell.perception.features.feature_model import CLASSES, FeatureModel, save_feature_model
 from touchcell.perception.networks.feature_training import LabelledFields, train_features
 from touchcell.simulation.feature_samples import feature_contacts
+from touchcell.simulation.samples import USUAL_VARIATION
 from touchcell.simulation.tip import Tip, TipParameters
 
 
@@ -18,7 +18,7 @@ def drawn(samples: int, seed: int) -> LabelledFields:
     """Return random contacts as displacements of the default tip's markers, the same for the same seed."""
     tip = Tip(TipParameters())
     rest = tip.project(tip.rest_positions)
-    classes, pixels = zip(*feature_contacts(samples, seed, variation=VARIATION), strict=True)
+    classes, pixels = zip(*feature_contacts(samples, seed, variation=USUAL_VARIATION), strict=True)
     return LabelledFields((np.stack(pixels) - rest).reshape(samples, -1), np.array(classes, np.int64))
 
 

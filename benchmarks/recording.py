@@ -1,0 +1,99 @@
+"""What recording a control cycle costs the control thread, beside an earlier version, in turns.
+
+    python -m benchmarks recording --against CHECKOUT [--rounds N]
+
+Cells that ship run for 8 s of their own time with both versions, from the same cell file of the earlier one; the CPU
+time of the thread in each cycle's recording, black box included, is measured around the method that does it, and the
+bytes of the file are divided by the cycles. Medians over cycles, then over rounds. The earlier version, 0.1.0, records
+JSON that viewers do not draw; this one also records what they draw, and how near the interlocks are to their limits.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from statistics import median
+from typing import Any, Final
+
+import yaml
+
+from touchcell.cell.bench.provenance import provenance
+from touchcell.paths import CHECKOUT
+
+AIM: Final = 0.6
+CELLS: Final = ("surface_follow_sim.yaml", "surface_follow_dome_sim.yaml")
+_RUN: Final = """
+import json, sys, time
+cell, out = sys.argv[1:]
+try:
+    from touchcell.cell.cli.main import main
+    from touchcell.cell.runtime.run_record import RunRecord as owner
+    name = "cycle"
+except ModuleNotFoundError:
+    from cell.cli import main
+    from cell.loop import RunLoop as owner
+    name = "_record"
+spent, record = [], getattr(owner, name)
+def measured(self, *arguments):
+    started = time.thread_time_ns()
+    record(self, *arguments)
+    spent.append(time.thread_time_ns() - started)
+setattr(owner, name, measured)
+sys.argv = ["touchcell"]
+code = main(["run", cell, "--quiet", "--out", out])
+spent = sorted(spent[50:])
+print(json.dumps({"us": 1e-3 * spent[len(spent) // 2], "cycles": len(spent) + 50}))
+"""
+
+
+def run(arguments: Sequence[str], out: Path) -> None:
+    """Print the table; write ``recording.json`` into ``out``."""
+    parser = argparse.ArgumentParser("python -m benchmarks recording", description=__doc__.partition("\n")[0])
+    parser.add_argument("--rounds", type=int, default=3, help="repetitions (default: %(default)s)")
+    parser.add_argument("--against", type=Path, required=True, metavar="CHECKOUT", help="of 0.1.0, with its own .venv")
+    options = parser.parse_args(arguments)
+    report: dict[str, Any] = {**provenance(), "rounds": options.rounds}
+    print(
+        f"{'recording one cycle':<26}{'CPU us then':>13}{'now':>7}{'ratio':>8}{'bytes then':>13}{'now':>7}{'ratio':>8}"
+    )
+    for cell in CELLS:
+        rows: dict[str, list[dict[str, float]]] = {"then": [], "now": []}
+        for _ in range(options.rounds):
+            for when, at in (("then", options.against.resolve()), ("now", CHECKOUT)):
+                rows[when].append(_run(at, options.against.resolve() / "configs" / cell))
+        found = {
+            when: {key: median(row[key] for row in each) for key in ("us", "bytes")} for when, each in rows.items()
+        }
+        then, now = found["then"], found["now"]
+        ratios = {key: now[key] / then[key] for key in then}
+        print(
+            f"{cell:<26}{then['us']:13.0f}{now['us']:7.0f}{ratios['us']:8.2f}"
+            f"{then['bytes']:13.0f}{now['bytes']:7.0f}{ratios['bytes']:8.2f}"
+        )
+        report[cell] = {**found, "ratio": ratios}
+    print(f"the aim: at most {AIM:g} of the CPU time; medians over {options.rounds} rounds in turns")
+    (out / "recording.json").write_text(json.dumps(report, indent=1) + "\n")
+
+
+def _run(checkout: Path, cell: Path) -> dict[str, float]:
+    """Run a cell with a checkout's own code; returns CPU us and bytes of recording a cycle."""
+    with tempfile.TemporaryDirectory() as name:
+        folder, data = Path(name), yaml.safe_load(cell.read_text())
+        path, out = folder / "cell.yaml", folder / "run"
+        path.write_text(yaml.safe_dump({**data, "max_duration_s": 8}))
+        environment = {key: value for key, value in os.environ.items() if key != "PYTHONDONTWRITEBYTECODE"}
+        done = subprocess.run(
+            [str(checkout / ".venv" / "bin" / "python"), "-c", _RUN, str(path), str(out)],
+            cwd=checkout,
+            capture_output=True,
+            text=True,
+            check=True,
+            env={**environment, "OMP_NUM_THREADS": "1"},
+        )
+        found = json.loads(done.stdout.splitlines()[-1])
+        return {"us": found["us"], "bytes": (out / "run.mcap").stat().st_size / found["cycles"]}
