@@ -22,13 +22,23 @@ def _mirror() -> Array:
     return np.diag([1.0, -1.0, 1.0, -1.0, 1.0, -1.0])
 
 
-def _verdict(seen_as: Array, *, drift: Array | None = None, follow: float = 0.0, seed: int = 0) -> str:
+def _verdict(
+    seen_as: Array,
+    *,
+    drift: Array | None = None,
+    follow: float = 0.0,
+    turn: float = 0.0,
+    noise: float = 1.0,
+    seed: int = 0,
+) -> str:
     """Return the verdict on a simulated sensor that measures ``seen_as @ xi`` of its true contact.
 
     Args:
         seen_as: (6, 6).
         drift: (6,) twist of a surface that moves.
         follow: share of the arm's shift along the surface with which a loose object follows it.
+        turn: share of its turn about one axis, likewise.
+        noise: factor on it.
     """
     rng = np.random.default_rng(seed)
     check = SensorCheck(1.0, press_mm=0.5, shift_mm=0.3, tilt_deg=1.0)
@@ -40,10 +50,10 @@ def _verdict(seen_as: Array, *, drift: Array | None = None, follow: float = 0.0,
         check.record_pose(now_ns, T_b_s)
         if cycle % 3 == 0:
             xi = seen_as @ se3.log(se3.compose(se3.inverse(T_b_s), T_b_f))
-            check.record_contact(cycle, now_ns, se3.exp(xi + rng.normal(0.0, NOISE)))
+            check.record_contact(cycle, now_ns, se3.exp(xi + rng.normal(0.0, noise * NOISE)))
         V = check.step(PERIOD_S, T_b_s)
         T_b_s = se3.compose(T_b_s, se3.exp(PERIOD_S * V))
-        along = np.array([follow, follow, 0.0, 0.0, 0.0, 0.0]) * V
+        along = np.array([follow, follow, 0.0, 0.0, turn, 0.0]) * V
         moved = se3.compose(se3.compose(T_b_s, se3.exp(PERIOD_S * along)), se3.inverse(T_b_s))
         T_b_f = se3.compose(moved, T_b_f)
         if drift is not None:
@@ -86,6 +96,22 @@ def test_surface_that_moves_evenly_is_no_fault_of_the_sensor() -> None:
 @pytest.mark.parametrize("follow", [0.5, 1.0])
 def test_loose_object_is_no_fault_of_the_sensor(follow: float) -> None:
     assert _verdict(np.eye(6), follow=follow) == ""
+
+
+@pytest.mark.parametrize("turn", [0.5, 1.0, 1.3])
+@pytest.mark.parametrize("seed", range(3))
+def test_object_that_turns_with_the_sensor_is_no_fault_of_it(turn: float, seed: int) -> None:
+    """One that stands on a table turns about the vertical axis only, and may turn farther than the sensor."""
+    assert _verdict(np.eye(6), turn=turn, seed=seed) == ""
+    assert _verdict(_mirror(), turn=turn, seed=seed) != ""
+
+
+@pytest.mark.parametrize("part", ["shear", "tilt"])
+def test_model_of_which_one_part_is_mirrored_is_named(part: str) -> None:
+    seen_as = _mirror()
+    seen_as[3:, 3:] = np.eye(3) if part == "shear" else seen_as[3:, 3:]
+    seen_as[:3, :3] = np.eye(3) if part == "tilt" else seen_as[:3, :3]
+    assert _verdict(seen_as, noise=0.3).startswith(f"another model: the estimated {part} moves as in a mirror")
 
 
 def test_too_few_estimates_are_no_agreement() -> None:

@@ -25,12 +25,13 @@ _LEAST_GAIN = 0.3
 # learnt them reports several times as much shear. How the sensor is tilted has no such excuse.
 _MOST_GAIN = {"shear": 20.0, "tilt": 3.0}
 _SURE = 2.5
+_MIRROR_RATIO = 2.0
 _MOST_TURN_DEG = 30.0
 _OPPOSITE_DEG = 90.0
 _PRESS_SHARE = 0.15
 _BACK_PER_S = 10.0
 _BACK_PER_S2 = 25.0
-_MOST_DRAG = np.array([2e-3] * 3 + [math.radians(2.0)] * 3)
+_MOST_DRAG_M_S = 2e-3
 _BACK_S = 0.2
 _BEHIND_M, _BEHIND_RAD = 0.1e-3, math.radians(0.2)
 
@@ -53,6 +54,21 @@ class Answer:
     def clear(self) -> bool:
         """True if there is an answer beyond the noise."""
         return max(abs(self.straight), abs(self.mirrored)) > max(_LEAST_GAIN, _SURE * self.deviation)
+
+    @property
+    def handedness(self) -> int:
+        """1 if the answer is straight, -1 if it is that of a mirror, 0 if it may be either."""
+        more = abs(self.straight) - abs(self.mirrored)
+        return 0 if abs(more) <= _SURE * self.deviation else int(math.copysign(1.0, more))
+
+    @property
+    def is_mirror_alone(self) -> bool:
+        """True if little but a mirror answers so.
+
+        An object that turns with the sensor about one axis leaves the answer about the other: straight and mirrored
+        parts are as large as each other then, and one that turns farther than the sensor makes the mirrored one larger.
+        """
+        return abs(self.mirrored) - _SURE * self.deviation > _MIRROR_RATIO * abs(self.straight)
 
     @property
     def turn_deg(self) -> float:
@@ -83,7 +99,7 @@ class SensorCheck:
         self._seq = -1
         self._t_s = 0.0
         self._start: Array | None = None
-        self._drag = np.zeros(6)
+        self._drag = np.zeros(3)
 
     @property
     def finished(self) -> bool:
@@ -113,8 +129,9 @@ class SensorCheck:
         behind = se3.log(se3.compose(se3.inverse(T_base_sensor), se3.compose(self._start, se3.exp(before))))
         if np.linalg.norm(behind[:3]) < _BEHIND_M and np.linalg.norm(behind[3:]) < _BEHIND_RAD:
             self._t_s = min(self._t_s + dt_s, self._duration_s + _BACK_S)
-        self._drag = np.clip(self._drag + dt_s * _BACK_PER_S2 * behind, -_MOST_DRAG, _MOST_DRAG)
-        twist: Array = (self._displacement(self._t_s) - before) / dt_s + _BACK_PER_S * behind + self._drag
+        self._drag = np.clip(self._drag + dt_s * _BACK_PER_S2 * behind[:3], -_MOST_DRAG_M_S, _MOST_DRAG_M_S)
+        twist: Array = (self._displacement(self._t_s) - before) / dt_s + _BACK_PER_S * behind
+        twist[:3] += self._drag
         return twist
 
     def verdict(self) -> str:
@@ -127,9 +144,12 @@ class SensorCheck:
         clear = {name: answer for name, answer in answers.items() if answer.clear}
         if not clear:
             return f"another model: estimated {' and '.join(answers)} do not follow the arm"
+        mirrored = [name for name, answer in clear.items() if answer.handedness < 0]
+        if mirrored and not any(answer.handedness > 0 for answer in clear.values()):
+            return f"camera mirrored: the estimated {mirrored[0]} moves as in a mirror when the arm moves"
         for name, answer in clear.items():
-            if abs(answer.mirrored) - abs(answer.straight) > _SURE * answer.deviation:
-                return f"camera mirrored: the estimated {name} moves as in a mirror when the arm moves"
+            if name in mirrored and answer.is_mirror_alone:
+                return f"another model: the estimated {name} moves as in a mirror when the arm moves, the rest does not"
             if abs(answer.straight) - _SURE * answer.deviation > _MOST_GAIN[name]:
                 return f"another model: the estimated {name} moves {abs(answer.straight):.1f} times as far as the arm"
         apart = [answer.turn_deg for answer in clear.values()]
