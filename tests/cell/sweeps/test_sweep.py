@@ -97,7 +97,7 @@ def test_an_invalid_section_is_named_with_file_and_key(text, key, tmp_path):
         ["--grid", "task.depth_mm"],
         ["--grid", "=3"],
         ["--sample", "seed=gauss(1, 2)"],
-        ["--minimise", "duration_s"],
+        ["--search", "duration_s"],
         ["--grid", "tusk.depth_mm=1,2"],
         ["--executor", "locl"],
     ],
@@ -117,7 +117,7 @@ def test_a_measure_that_no_trial_has_is_refused_with_a_suggestion(tmp_path):
 
 def test_a_search_finds_the_fastest_run_that_ends_as_done(tmp_path, capsys):
     pytest.importorskip("optuna")
-    options = ["--sample", "task.speed_mm_s=uniform(15, 40)", "--minimise", "duration_s", "--trials", "4"]
+    options = ["--sample", "task.speed_mm_s=uniform(15, 40)", "--search", "duration_s", "--trials", "4"]
     assert sweep(*options, "--out", str(tmp_path)) == 0
     printed = capsys.readouterr().out
     assert "smallest duration_s of 4 trials" in printed

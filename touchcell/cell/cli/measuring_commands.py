@@ -61,7 +61,7 @@ def add_parser(commands: Subparsers) -> None:
     sweep.add_argument(
         "--measure", action="append", default=[], metavar="NAME", help="number to show, with *; repeatable"
     )
-    sweep.add_argument("--minimise", metavar="NAME", help="search the --sample ranges for the smallest NAME (Optuna)")
+    sweep.add_argument("--search", metavar="NAME", help="search the --sample ranges for the smallest NAME (Optuna)")
     sweep.add_argument("--trials", type=positive, default=50, help="trials of a search (default: %(default)s)")
     sweep.add_argument(
         "--out", type=Path, metavar="DIR", help="folder; the same command goes on in it (default: runs/sweeps/NAME)"
@@ -134,7 +134,7 @@ def _sweep(options: argparse.Namespace) -> int:
     grid = {**section.grid, **pairs(options.grid, "--grid")}
     sample = {**section.sample, **pairs(options.sample, "--sample")}
     folder = options.out or RUNS / "sweeps" / cell.stem
-    searching = options.minimise is not None
+    searching = options.search is not None
     factors = make_factors({} if searching else grid, sample, options.samples or section.samples, section.seed)
     measures = tuple(options.measure) or section.measures
     sweep = Sweep(cell, factors, measures, settings=parse_settings(options.set))
@@ -157,11 +157,11 @@ def _search(options: argparse.Namespace, sweep: Sweep, folder: Path) -> int:
 
     space = {key: draw for key, draw in sweep.factors.sampled.items() if isinstance(draw, Distribution)}
     if not space:
-        raise ConfigError("there is nothing to search", key="--minimise", hint="--sample 'task.gain=uniform(0.5, 2)'")
+        raise ConfigError("there is nothing to search", key="--search", hint="--sample 'task.gain=uniform(0.5, 2)'")
     found = search(
         sweep,
         space,
-        options.minimise,
+        options.search,
         options.trials,
         folder,
         workers=workers_of(options),
@@ -172,7 +172,7 @@ def _search(options: argparse.Namespace, sweep: Sweep, folder: Path) -> int:
         print(f"none of {len(found.finished)} trials ended as done: {found.finished[-1].reason}")
         return EXIT_TASK_FAILED
     changes = {key: found.best.trial.changes[key] for key in space}
-    print(f"smallest {options.minimise} of {len(found.finished)} trials: {found.best.measures[options.minimise]:.4g}")
+    print(f"smallest {options.search} of {len(found.finished)} trials: {found.best.measures[options.search]:.4g}")
     for key, value in changes.items():
         print(f"  --set {key}={value}")
     print(f"  touchcell run {found.best.folder.path}/cell.yaml")

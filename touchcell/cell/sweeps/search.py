@@ -91,7 +91,7 @@ def search(
         finished += ended
     if all(measure not in each.measures for each in finished):
         known = sorted({name for each in finished for name in each.measures})
-        raise ConfigError("no trial has such a measure", key="--minimise", value=measure, hint=", ".join(known[:20]))
+        raise ConfigError("no trial has such a measure", key="--search", value=measure, hint=", ".join(known[:20]))
     feasible = [each for each in finished if each.done and measure in each.measures]
     best = min(feasible, key=lambda each: abs(each.measures[measure]), default=None)
     return Searched(best, tuple(finished))
