@@ -220,6 +220,10 @@ class ContactServo:
         self.arm = arm
         self.sensor = sensor
         self.run = run
+        # Classified once: isinstance with a Protocol in each cycle costs as much as the control law.
+        self.sidestepping_run = run if isinstance(run, Sidestepping) else None
+        self.feature_run = run if isinstance(run, NeedsFeature) else None
+        self._easing_run = run if isinstance(run, Easing) else None
         self._config = config
         self._T_tcp_sensor = context.T_tcp_sensor[sensor]
         self._running_axes = None if all(running_axes) else np.array(running_axes, np.float64)
@@ -362,8 +366,8 @@ class ContactServo:
     def start_approach(self) -> None:
         """Measure the travelled distance from the current pose, from which the sensor approaches."""
         self.reset_travel()
-        if isinstance(self.run, Sidestepping) and self.T_base_sensor is not None:
-            self.run.begin_approach(self.T_base_sensor)
+        if self.sidestepping_run is not None and self.T_base_sensor is not None:
+            self.sidestepping_run.begin_approach(self.T_base_sensor)
 
     def reset_travel(self) -> None:
         """Measure the travelled distance from the current pose."""
@@ -372,15 +376,16 @@ class ContactServo:
     def start_sidestep(self) -> None:
         """Let go of the object and go where the behavior says; a behavior that never asks keeps its contact."""
         self._goal, self._felt_s = None, 0.0
-        if self.T_base_sensor is None or not isinstance(self.run, Sidestepping) or not self.run.may_sidestep:
+        run = self.sidestepping_run
+        if self.T_base_sensor is None or run is None or not run.may_sidestep:
             return
-        self.run.begin_sidestep(self.T_base_sensor)
-        self._goal = self.run.next_goal(self.T_base_sensor, None)
+        run.begin_sidestep(self.T_base_sensor)
+        self._goal = run.next_goal(self.T_base_sensor, None)
 
     @property
     def only_touches(self) -> bool:
         """True if the contact shall not be pressed, as it is to be given up."""
-        return isinstance(self.run, Sidestepping) and self.run.only_touches
+        return self.sidestepping_run is not None and self.sidestepping_run.only_touches
 
     @property
     def sidestepping(self) -> bool:
@@ -419,8 +424,8 @@ class ContactServo:
 
     def _next_goal(self, T_s_f: Array | None) -> None:
         assert self.T_base_sensor is not None
-        assert isinstance(self.run, Sidestepping)
-        self._goal, self._felt_s = self.run.next_goal(self.T_base_sensor, T_s_f), 0.0
+        assert self.sidestepping_run is not None
+        self._goal, self._felt_s = self.sidestepping_run.next_goal(self.T_base_sensor, T_s_f), 0.0
 
     def travelled_m(self) -> float:
         """Return the distance of the sensor from its pose at ``reset_travel``, m; 0 while it is unknown."""
@@ -457,7 +462,7 @@ class ContactServo:
     def servo_step(self, V_ff: Array, *, running: bool = True) -> Array | None:
         """Return the twist (6,) of the tool that holds the contact; None while there is no valid estimate."""
         T_s_f = self.T_s_f
-        if T_s_f is not None and isinstance(self.run, Easing) and (ease_m := self.run.ease_m) > 0.0:
+        if T_s_f is not None and self._easing_run is not None and (ease_m := self._easing_run.ease_m) > 0.0:
             # To the controller it is pressed in by as much more.
             T_s_f = se3.compose(T_s_f, se3.exp([0.0, 0.0, -ease_m, 0.0, 0.0, 0.0]))
         V_tcp = self.controller.step(T_s_f, 0 if self.contact is None else self.contact.t_ns, V_ff)

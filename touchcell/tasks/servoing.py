@@ -13,7 +13,7 @@ from touchcell.drivers.core.commands import TwistCommand, TwistFrame
 from touchcell.drivers.core.protocols import SERVO_ARM
 from touchcell.errors import TouchcellError
 from touchcell.geometry.types import Array
-from touchcell.tasks.contact_servo import Behavior, ContactServo, ContactServoConfig, NeedsFeature, Sidestepping, Six
+from touchcell.tasks.contact_servo import Behavior, ContactServo, ContactServoConfig, Six
 from touchcell.tasks.interface import SPEED, Action, Observation, TaskContext, TaskSpec, TransitionRecord
 from touchcell.tasks.planned_places import PlannedPlace
 from touchcell.tasks.sensor_check import SensorCheck
@@ -209,8 +209,9 @@ class ServoTask(MachineTask):
         self._period_s = 1.0 / context.rate_hz
         self._servos = servos
         timeout_s = min(servo.run.timeout_s for servo in servos)
-        sidesteps = any(isinstance(servo.run, Sidestepping) and servo.run.may_sidestep for servo in servos)
-        needs_feature = any(isinstance(servo.run, NeedsFeature) for servo in servos)
+        self._sidestepping = [run for servo in servos if (run := servo.sidestepping_run) is not None]
+        sidesteps = any(run.may_sidestep for run in self._sidestepping)
+        needs_feature = any(servo.feature_run is not None for servo in servos)
         table = servo_table(
             name, config, timeout_s, sidesteps=sidesteps, servos=len(servos), needs_feature=needs_feature
         )
@@ -365,7 +366,7 @@ class ServoTask(MachineTask):
                         self._post("missed", missed)
                     else:
                         self._post("finished")
-                elif any(isinstance(s.run, Sidestepping) and s.run.wants_sidestep for s in servos):
+                elif any(run.wants_sidestep for run in self._sidestepping):
                     self._post("aside", "the object is to be touched elsewhere")
             case ServoState.RETURN:
                 self._watch_sight(dt_s, blind=not all(servo.has_fresh_data for servo in servos))
@@ -382,11 +383,8 @@ class ServoTask(MachineTask):
     def _astray(self, dt_s: float) -> str:
         """Return why a behavior cannot go on, by what its sensor touches; empty where all can."""
         for servo in self._servos:
-            if (
-                servo.contact is not None
-                and isinstance(servo.run, NeedsFeature)
-                and (why := servo.run.astray(dt_s, servo.contact.touched))
-            ):
+            run = servo.feature_run
+            if servo.contact is not None and run is not None and (why := run.astray(dt_s, servo.contact.touched)):
                 return f"{servo.sensor}: {why}"
         return ""
 
