@@ -65,7 +65,7 @@ def test_every_state_of_every_task_is_tested_or_equal_to_a_tested_one(tmp_path: 
         ("single_arm_pushing", "arm"): ["run"],
         ("dual_arm_pushing", "leader"): ["run"],
         ("dual_arm_pushing", "follower"): ["run"],
-        ("data_collection", "arm"): ["prepare", "press", "grab", "retract"],
+        ("data_collection", "arm"): ["prepare", "press", "grab", "roam", "retract"],
     }
     assert found[Place("franka", "reflex", "object_tracking", "arm", "settle")] == SERVO
     assert found[Place("franka", "reflex", "data_collection", "arm", "tilt")] == REACH

@@ -69,7 +69,14 @@ def sensor_of(role: str) -> str:
     return "sensor" if role == "arm" else f"{role}_sensor"
 
 
-def arm_cell(task: str, role: str, rig: DeviceFixture, T_base_tcp: Array, collected: str) -> dict[str, Any]:
+def arm_cell(
+    task: str,
+    role: str,
+    rig: DeviceFixture,
+    T_base_tcp: Array,
+    collected: str,
+    settings: Mapping[str, Any] | None = None,
+) -> dict[str, Any]:
     """Return a cell in which the emulated arm of ``rig`` has ``role`` in ``task``, its tool at ``T_base_tcp``.
 
     Args:
@@ -78,6 +85,7 @@ def arm_cell(task: str, role: str, rig: DeviceFixture, T_base_tcp: Array, collec
         rig: of the emulated arm.
         T_base_tcp: (4, 4) its tool in its base, which is the world frame.
         collected: folder for data collection.
+        settings: keys of the task, of one that does not push.
     """
     assert rig.config is not None
     emulated = {"driver": rig.spec.name, "deactivate": "hold", **rig.config.model_dump(mode="json", exclude_unset=True)}
@@ -88,7 +96,8 @@ def arm_cell(task: str, role: str, rig: DeviceFixture, T_base_tcp: Array, collec
         if task == "data_collection":
             estimator = _known_surface(T_base_tcp @ _GAP)
         sensors = {sensor_of(role): _simulated_sensor(role, np.eye(4), estimator)}
-        return _cell(task, arms, sensors, {role: T_base_tcp[:3, 3]}, {"scene": scene, **_collect(task, collected)})
+        extra = {"scene": scene, **_collect(task, collected)}
+        return _cell(task, arms, sensors, {role: T_base_tcp[:3, 3]}, extra, settings)
     tip, ahead = T_base_tcp[:3, 3], _ahead(T_base_tcp)
     middle = tip + (_TIP_RADIUS_M + _GAP_M + _PRISM_M[0] / 2) * ahead
     sensors = {sensor_of(role): _simulated_sensor(role, _across(T_base_tcp, ahead), {"kind": "true_contact"})}
@@ -118,18 +127,23 @@ def arm_cell(task: str, role: str, rig: DeviceFixture, T_base_tcp: Array, collec
     return _cell(task, arms, sensors, tips, {"scene": scene}, target)
 
 
-def camera_cell(task: str, cameras: Mapping[str, DeviceFixture], collected: str) -> dict[str, Any]:
-    """Return a cell in which the emulated cameras, by role of their sensor, are mounted on simulated arms."""
+def camera_cell(
+    task: str, cameras: Mapping[str, DeviceFixture], collected: str, of_state: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Return a cell in which the emulated cameras, by role of their sensor, are mounted on simulated arms.
+
+    ``of_state`` are keys of the task.
+    """
     roles = FAULT_ROLES.get(task, ())
     arms, sensors, tips = {}, {}, {}
-    settings: dict[str, Any] = {}
+    settings: dict[str, Any] = dict(of_state)
     for number, role in enumerate(roles):
         # Far enough apart that they do not meet.
         T_base_tcp = se3.from_euler_mm_deg([400.0, 400.0 * number, 300.0, *_DOWN])
         T_tcp_s = np.eye(4)
         if task.endswith("pushing"):
             T_tcp_s = _across(T_base_tcp, np.array([1.0, 0.0, 0.0]))
-            settings.setdefault("target_mm", (1e3 * T_base_tcp[:2, 3] + [200.0, 0.0]).tolist())
+            settings.setdefault("target_mm", (1e3 * T_base_tcp[:2, 3] + [100.0, 0.0]).tolist())
         arms[role], tips[role] = _simulated_arm(T_base_tcp), T_base_tcp[:3, 3]
         surface = _known_surface(T_base_tcp @ T_tcp_s @ _GAP)
         sensors[sensor_of(role)] = _emulated_sensor(cameras[sensor_of(role)], surface, role, T_tcp_s)

@@ -27,6 +27,7 @@ from tests.fault_injection.emulated_cells import (
     sensor_of,
     sensors_of,
 )
+from tests.fault_injection.fault_matrix import SETTINGS_OF_STATES
 from tests.fault_injection.sent_commands import SentCommands
 from touchcell.cell.config.cell_plan import CellPlan
 from touchcell.cell.config.schema import plan_cell
@@ -348,7 +349,8 @@ class Bench:
         if place.driver not in self._poses:
             self._poses[place.driver] = _reported_pose(rig)
         collected = self._collected()
-        return self._planned(arm_cell(place.task, place.role, rig, self._poses[place.driver], str(collected)))
+        pose, settings = self._poses[place.driver], SETTINGS_OF_STATES.get(place.state)
+        return self._planned(arm_cell(place.task, place.role, rig, pose, str(collected), settings))
 
     def _camera_plan(self, place: Place, rig: DeviceFixture, exits: ExitStack) -> CellPlan:
         rigs = {}
@@ -358,7 +360,8 @@ class Bench:
                 continue
             rigs[sensor] = RIGS.load(place.driver)(self.folder, self.address + number)
             _started(rigs[sensor], exits)
-        plan = self._planned(camera_cell(place.task, rigs, str(self._collected())))
+        settings = SETTINGS_OF_STATES.get(place.state, {})
+        plan = self._planned(camera_cell(place.task, rigs, str(self._collected()), settings))
         # No kernel module is needed: this process queries the emulator instead of the kernel.
         sensors = {
             name: replace(device, spec=replace(device.spec, build=_on_shim(rigs[name])))

@@ -51,7 +51,7 @@ class Fault:
         device: kind of the device; a task without an arm has no faults of one.
         inject: injects it.
         expected: kinds of interlock or error, one of which has to end the run; empty if the run has to end without.
-        unseen: states in which it has no observable effect, or "state, role" where one arm alone has none, and why.
+        unseen: states in which it has no observable effect, or "state, task" where one task alone has none, and why.
         obeys: True if the arm still stops by its category; if not, it takes twice as long ...
         extra_m_s: ... and moves at this speed in addition.
     """
@@ -103,7 +103,8 @@ _STANDS = {
     "note": "the arm stands still",
     "idle": "the arm stands still",
     "release": "the arm stands still",
-    "settle, follower": "it only touches until the arms are opposite each other",
+    "settle, single_arm_pushing": "it only touches until it lets go again",
+    "settle, dual_arm_pushing": "they only touch until they let go again, or are opposite each other",
 }
 _NO_BASELINE = {"prepare": "the first frames are the reference", "wait": "the first frames are the reference"}
 
@@ -233,6 +234,10 @@ class Place:
     state: str
 
 
+SETTINGS_OF_STATES: Mapping[str, Mapping[str, Any]] = {
+    "roam": {"motions": "sequence", "samples": 200, "sequence_frames": 200},
+}
+"""Keys of the task without which a state is never entered."""
 _NOT_VISITED: Mapping[str, frozenset[str]] = {
     "arm": frozenset({"check", "return"}),
     "camera": frozenset({"return"}),
@@ -262,7 +267,8 @@ def places(devices: Sequence[str] = ("arm", "camera"), tasks: Sequence[str] | No
                     for state in probe.task.states:
                         if state in _NOT_VISITED[kind]:
                             continue
-                        yield Place(cell, fault.name, device, state)
+                        own = {**cell, "task": {**cell["task"], **SETTINGS_OF_STATES.get(state, {})}}
+                        yield Place(own, fault.name, device, state)
 
 
 def run_place(place: Place) -> Case:
@@ -339,7 +345,7 @@ def _judged(
     by = "" if result.error is None else type(result.error).__name__
     if first is not None:
         by = kinds.get(first.interlock, first.interlock)
-    unseen = case.state in fault.unseen or f"{case.state}, {case.device}" in fault.unseen
+    unseen = case.state in fault.unseen or f"{case.state}, {case.task}" in fault.unseen
     expected: frozenset[str] = frozenset() if unseen else fault.expected
     if by not in (expected or {""}):
         problems.append(f"ended by {by or 'nothing'}, expected {' or '.join(sorted(expected)) or 'nothing'}")

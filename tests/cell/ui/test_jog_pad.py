@@ -21,6 +21,9 @@ from touchcell.drivers.core.jog import JogFrame, JogMode
 pytest.importorskip("nicegui")
 client = pytest.importorskip("websockets.sync.client")
 
+# NiceGUI looks for its server among all objects of the process, and a deprecated one of PyTorch warns when looked at.
+pytestmark = pytest.mark.filterwarnings("ignore::FutureWarning")
+
 MS = 1_000_000
 NOW = 10_000 * MS
 TOKEN = "secret"

@@ -170,7 +170,7 @@ def test_a_panda_tracks_a_moving_plate_in_a_dynamic_scene(tmp_path: Path) -> Non
         result = RunLoop(cell, None, on_cycle=watch).run()
     assert result.outcome is Outcome.DONE, result.reason
     assert len(depths_mm) > 100
-    assert np.sqrt(np.mean((np.array(depths_mm[50:]) - 6.0) ** 2)) < 0.5
+    assert np.sqrt(np.mean((np.array(depths_mm[50:]) - data["task"]["depth_mm"]) ** 2)) < 0.5
 
 
 def test_an_unreachable_pose_is_reported() -> None:
