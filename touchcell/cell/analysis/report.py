@@ -95,8 +95,12 @@ def _mounts(source: RunFolder) -> dict[str, tuple[Array, Array]]:
     if plan is None:
         return {}
     sits = {section.mounted_on: section.T_tcp_sensor for section in plan.cell.sensors.values()}
+    role_of = {name: role for role, name in plan.arm_roles.items()}
+    # In the order of the cell file, by which arms have their colours in every picture.
     return {
-        role: (plan.cell.arms[name].T_world_base, sits.get(name, np.eye(4))) for role, name in plan.arm_roles.items()
+        role_of[name]: (arm.T_world_base, sits.get(name, np.eye(4)))
+        for name, arm in plan.cell.arms.items()
+        if name in role_of
     }
 
 

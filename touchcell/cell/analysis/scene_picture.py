@@ -55,13 +55,13 @@ class ScenePicture:
             if len(corners):
                 order = 0 if ground else 2
                 collection = Poly3DCollection(
-                    corners, facecolors=colours, edgecolors=colours, linewidths=0.3, zorder=order
+                    corners, facecolors=colours, edgecolors=colours, linewidths=0.3, zorder=order, clip_on=False
                 )
                 self._drawn.append(self._axis.add_collection3d(collection))
         for part in self._lines:
             assert isinstance(part.solid, Polyline)
             points = _moved(part.solid.points_m, self._T(part, moment))
-            line = Line3DCollection([points], colors=[part.colour], linewidths=1.6, zorder=1)
+            line = Line3DCollection([points], colors=[part.colour], linewidths=1.6, zorder=1, clip_on=False)
             self._drawn.append(self._axis.add_collection3d(line))
 
     def _triangles(self, moment: int, ground: bool) -> tuple[Array, Array]:

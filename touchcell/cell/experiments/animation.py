@@ -140,7 +140,7 @@ class _Stage:
             self._trails.pop().remove()
         for role, poses in self._shown.tips.items():
             past = poses.T_world[poses.t_s <= t_s][:, :3, 3]
-            self._trails += self._axis.plot(*past.T, color=self._colour(role), lw=1.2, zorder=3)
+            self._trails += self._axis.plot(*past.T, color=self._colour(role), lw=1.2, zorder=3, clip_on=False)
         for role, picture in self._images.items():
             picture.set_data(self._shown.images[role](t_s))
         self._axis.set_title(self._caption(t_s), fontsize=10, loc="left")
