@@ -15,7 +15,7 @@ from pydantic import PositiveFloat
 from touchcell.geometry import gaussian, se3
 from touchcell.geometry.gaussian import PoseGaussian
 from touchcell.geometry.types import Array
-from touchcell.perception.runtime.filter_spec import FilterConfig, FilterSpec, FilterState
+from touchcell.perception.runtime.filter_spec import FilterConfig, FilterSpec, FilterState, state_before
 
 
 class PoseFilter:
@@ -52,11 +52,7 @@ class PoseFilter:
         Raises:
             ValueError: no observation yet, or ``t_ns`` is before the state's time.
         """
-        state = self._state
-        if state is None:
-            raise ValueError("predict before the first observation")
-        if t_ns < state.t_ns:
-            raise ValueError(f"cannot predict back from {state.t_ns} to {t_ns} ns")
+        state = state_before(self._state, t_ns)
         U = se3.compose(se3.inverse(T_base_sensor), state.T_base_sensor)
         noise = self._noise_density * ((t_ns - state.t_ns) * 1e-9)
         return gaussian.compound(U, state.belief, noise=noise, order=self._order)

@@ -21,6 +21,19 @@ class FilterState:
     nis: float | None = None
 
 
+def state_before(state: FilterState | None, t_ns: int) -> FilterState:
+    """Return ``state``, from which an estimate at ``t_ns`` may be predicted.
+
+    Raises:
+        ValueError: there was no observation yet, or ``t_ns`` is before it.
+    """
+    if state is None:
+        raise ValueError("predict before the first observation")
+    if t_ns < state.t_ns:
+        raise ValueError(f"cannot predict back from {state.t_ns} to {t_ns} ns")
+    return state
+
+
 class ContactFilter(Protocol):
     """Interface of the filters ``PoseFilter`` and ``moving_surface.MovingSurfaceFilter``."""
 

@@ -38,7 +38,7 @@ from touchcell.geometry import gaussian, se3
 from touchcell.geometry.gaussian import NotPositiveDefinite, PoseGaussian
 from touchcell.geometry.types import Array
 from touchcell.perception.runtime.filter import isotropic_noise, require_noise_density, require_pose
-from touchcell.perception.runtime.filter_spec import FilterConfig, FilterSpec, FilterState
+from touchcell.perception.runtime.filter_spec import FilterConfig, FilterSpec, FilterState, state_before
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,11 +132,8 @@ class MovingSurfaceFilter:
         return belief, SurfaceMotion(way.Ad_U @ way.before.twist, P)
 
     def _way(self, T_base_sensor: Array, t_ns: int) -> _Way:
-        state, motion = self._state, self._motion
-        if state is None or motion is None:
-            raise ValueError("predict before the first observation")
-        if t_ns < state.t_ns:
-            raise ValueError(f"cannot predict back from {state.t_ns} to {t_ns} ns")
+        state, motion = state_before(self._state, t_ns), self._motion
+        assert motion is not None
         dt = (t_ns - state.t_ns) * 1e-9
         U = se3.compose(se3.inverse(T_base_sensor), state.T_base_sensor)
         UE = se3.compose(U, se3.exp(motion.twist * dt))

@@ -29,7 +29,7 @@ from touchcell.geometry.gaussian import PoseGaussian
 from touchcell.geometry.types import Array
 from touchcell.perception.models.prediction import slip_probability
 from touchcell.perception.runtime.filter import isotropic_noise, require_noise_density, require_pose
-from touchcell.perception.runtime.filter_spec import FilterConfig, FilterSpec, FilterState
+from touchcell.perception.runtime.filter_spec import FilterConfig, FilterSpec, FilterState, state_before
 
 _LEAST, _MOST = 0.05, 0.999
 """Bounds of the prior probability that the skin has slipped."""
@@ -75,11 +75,7 @@ class SlipAwareFilter:
         Raises:
             ValueError: no observation yet, or ``t_ns`` is before the state's time.
         """
-        state = self._state
-        if state is None:
-            raise ValueError("predict before the first observation")
-        if t_ns < state.t_ns:
-            raise ValueError(f"cannot predict back from {state.t_ns} to {t_ns} ns")
+        state = state_before(self._state, t_ns)
         U = se3.compose(se3.inverse(T_base_sensor), state.T_base_sensor)
         return gaussian.compound(U, state.belief, noise=self._noise_density * ((t_ns - state.t_ns) * 1e-9))
 

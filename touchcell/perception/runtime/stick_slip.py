@@ -27,7 +27,7 @@ from touchcell.geometry import gaussian, se3
 from touchcell.geometry.gaussian import PoseGaussian
 from touchcell.geometry.types import Array
 from touchcell.perception.runtime.filter import isotropic_noise, require_noise_density, require_pose
-from touchcell.perception.runtime.filter_spec import FilterConfig, FilterSpec, FilterState
+from touchcell.perception.runtime.filter_spec import FilterConfig, FilterSpec, FilterState, state_before
 
 _LEARNING: Final = 0.5
 """Part of a share's error that one informative innovation takes away."""
@@ -102,11 +102,8 @@ class StickSlipFilter:
         return self._state
 
     def _moved(self, T_base_sensor: Array, t_ns: int) -> tuple[PoseGaussian, Array]:
-        state, own = self._state, self._own
-        if state is None or own is None:
-            raise ValueError("predict before the first observation")
-        if t_ns < state.t_ns:
-            raise ValueError(f"cannot predict back from {state.t_ns} to {t_ns} ns")
+        state, own = state_before(self._state, t_ns), self._own
+        assert own is not None
         motion = se3.log(se3.compose(se3.inverse(T_base_sensor), state.T_base_sensor))
         dt_s = (t_ns - state.t_ns) * 1e-9
         noise = self._noise_density * dt_s + np.diag(self._process * dt_s)
