@@ -36,6 +36,9 @@ from touchcell.drivers.kinematics.joint_limits import IkSettings
 
 _FRAME_POLL_NS: Final = 1_000_000
 _FIRST_FRAME_S: Final = 5.0
+_LONGEST_TTL_S: Final = 1.0
+_REFUSAL_S: Final = 0.25
+"""Within this the host says why a command with an impossible time-to-live is refused."""
 
 
 class RemoteDevice(Device):
@@ -252,7 +255,7 @@ class RemoteArm(RemoteDevice):
         link.wake()
 
     def _await_answer(self, link: HostLink, ttl_s: float) -> tuple[Any, bytes]:
-        seconds = ttl_s if math.isfinite(ttl_s) and ttl_s > 0.0 else 1e-3
+        seconds = ttl_s if 0.0 < ttl_s <= _LONGEST_TTL_S else _REFUSAL_S
         deadline_ns = self._clock.now_ns() + round(1e9 * seconds)
         while True:
             _, answer, note = self._answers.read_all()
