@@ -63,6 +63,13 @@ class ResetRefused:
     reason: Refusal
 
 
+def unlogged_latch() -> Latch:
+    """Return a latch for rules that are only tried: what it latches is no event."""
+    logger = logging.Logger("tried rules")
+    logger.disabled = True
+    return Latch(logger)
+
+
 class Latch:
     """Latch for violations. Not thread-safe.
 

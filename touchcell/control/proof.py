@@ -5,7 +5,6 @@ See docs/explanation/armed-coverage.md.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -17,7 +16,7 @@ from touchcell.control.interlocks.settings import InterlockSettings
 from touchcell.control.interlocks.snapshot import CellView
 from touchcell.control.interlocks.timers import TimedInterlock
 from touchcell.control.interlocks.violation import Violation
-from touchcell.control.latch import Latch
+from touchcell.control.latch import unlogged_latch
 from touchcell.control.supervisor import LIMIT_FOR_NS, Supervisor
 
 _Healthy = Callable[[int, str], CellView]
@@ -117,10 +116,7 @@ def _shown(
     name: str, fault: Fault, interlock: Interlock | TimedInterlock, period_s: float, healthy: _Healthy, state: str
 ) -> tuple[float | None, str]:
     """Return the time from the fault to the trip in one state of the task, and why there was none."""
-    # These trips are none: nobody has to read of them.
-    quiet = logging.Logger("proof")
-    quiet.disabled = True
-    latch = Latch(quiet)
+    latch = unlogged_latch()
     supervisor = Supervisor([interlock], latch)
     period_ns = max(1, round(1e9 * period_s))
     before = max(_HEALTHY_CYCLES, -int(-1e9 * fault.before_s // period_ns))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -14,7 +13,7 @@ from touchcell.cell.config.armed import NotArmed, arm_roles
 from touchcell.control.interlocks.config import build_interlocks
 from touchcell.control.interlocks.coverage import CellFacts, with_arm, with_motion
 from touchcell.control.interlocks.snapshot import CellView
-from touchcell.control.latch import Latch
+from touchcell.control.latch import unlogged_latch
 from touchcell.control.supervisor import Supervisor
 from touchcell.geometry import se3
 from touchcell.geometry.errors import GeometryError
@@ -53,9 +52,7 @@ def trips_when_healthy(plan: CellPlan, facts: CellFacts) -> Iterator[NotArmed]:
         if not (entry.kind in _OF_TIMES or (at_start and _is_placed(entry, starts, facts))):
             continue
         (interlock,) = build_interlocks({name: entry}, poses, facts.scene)
-        quiet = logging.Logger("healthy start")
-        quiet.disabled = True
-        latch = Latch(quiet)
+        latch = unlogged_latch()
         supervisor = Supervisor([interlock], latch)
         for k in range(1 if at_start else cycles):
             t_s = first_s + k * facts.period_s

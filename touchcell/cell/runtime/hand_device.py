@@ -10,10 +10,11 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
+from touchcell.cell.runtime.child_processes import end_all
 from touchcell.cell.runtime.jog_channel import JogMessage, JogSender
 from touchcell.cell.runtime.jog_settings import JogSettings
 from touchcell.drivers.core.jog import AT_REST, HAND_DEVICES, Axes, HandDevice, HandState, JogButton, JogRequest
@@ -110,14 +111,7 @@ def devices_read(names: Sequence[str], folder: Path, arms: Sequence[str]) -> Ite
     try:
         yield
     finally:
-        for process in processes:
-            process.terminate()
-        for process in processes:
-            with suppress(subprocess.TimeoutExpired):
-                process.wait(_END_S)
-            if process.poll() is None:
-                process.kill()
-                process.wait()
+        end_all(processes, _END_S)
 
 
 def main() -> int:

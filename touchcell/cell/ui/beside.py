@@ -6,10 +6,11 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
+from touchcell.cell.runtime.child_processes import end_all
 from touchcell.errors import ConfigError, TouchcellError
 
 _END_S: Final = 3.0
@@ -44,12 +45,7 @@ def page_beside(folder: Path, port: int, *, moves: bool = False) -> Iterator[Non
     try:
         yield
     finally:
-        process.terminate()
-        with suppress(subprocess.TimeoutExpired):
-            process.wait(_END_S)
-        if process.poll() is None:
-            process.kill()
-            process.wait()
+        end_all([process], _END_S)
 
 
 def main() -> int:

@@ -13,6 +13,7 @@ from touchcell.drivers.damiao.capture import Capture, RecordedMotor, Request
 from touchcell.errors import ConfigError
 from touchcell.testing.emulation.base import Emulator
 from touchcell.testing.emulation.can_hub import Hub
+from touchcell.testing.emulation.playback import Playback
 
 _OPERATIONS = {0x33: "read", 0x55: "write", 0xCC: "state"}
 _STATES = ("state", "mit", "command")
@@ -39,7 +40,7 @@ class RecordedArm(Emulator):
         if not self._motors:
             raise ConfigError("no motor in the capture replied", hint="record while a client uses the arm")
         self._hub = Hub(path, self._on_frame)
-        self._next: dict[tuple[int, str, int], int] = {}
+        self._playback = Playback()
         self._unknown: set[tuple[int, Request]] = set()
         self._answered = 0
 
@@ -63,7 +64,7 @@ class RecordedArm(Emulator):
     def on_fault(self, fault: str, value: Any) -> None:
         """Begin again at once."""
         if fault == "again":
-            self._next.clear()
+            self._playback.begin_again()
             del self.active[fault]
 
     def _on_frame(self, message: can.Message) -> None:
@@ -111,7 +112,4 @@ class RecordedArm(Emulator):
             found = motor.replies[kind, key]
         if not found:
             return None
-        place = (motor.esc_id, kind, key)
-        at = self._next.get(place, 0)
-        self._next[place] = at + 1
-        return found[min(at, len(found) - 1)]
+        return self._playback.next_of((motor.esc_id, kind, key), found)

@@ -10,6 +10,7 @@ from touchcell.drivers.feetech.capture import Capture, RecordedServo, Request
 from touchcell.drivers.feetech.codec import Instruction, Packet
 from touchcell.errors import ConfigError
 from touchcell.testing.emulation.base import Emulator
+from touchcell.testing.emulation.playback import Playback
 from touchcell.testing.emulation.serial_line import SerialLine
 
 
@@ -40,7 +41,7 @@ class RecordedServos(Emulator):
         }
         self._line = line
         self._buffer = b""
-        self._next: dict[Request, int] = {}
+        self._playback = Playback()
         self._unknown: set[Request] = set()
         self._answered = 0
 
@@ -66,7 +67,7 @@ class RecordedServos(Emulator):
     def on_fault(self, fault: str, value: Any) -> None:
         """Begin again at once."""
         if fault == "again":
-            self._next.clear()
+            self._playback.begin_again()
             del self.active[fault]
 
     def _on_bytes(self, heard: bytes) -> None:
@@ -112,9 +113,7 @@ class RecordedServos(Emulator):
     def _recorded(self, servo: RecordedServo, request: Request) -> Packet | None:
         replies = servo.replies.get(request)
         if replies:
-            at = self._next.get(request, 0)
-            self._next[request] = at + 1
-            return replies[min(at, len(replies) - 1)]
+            return self._playback.next_of(request, replies)
         if request.code == Instruction.READ:
             known = [servo.registers.get(request.register + i) for i in range(request.length)]
             values = [value for value in known if value is not None]
