@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 
@@ -29,6 +31,7 @@ def _verdict(
     follow: float = 0.0,
     turn: float = 0.0,
     noise: float = 1.0,
+    slides_at_m: float = math.inf,
     seed: int = 0,
 ) -> str:
     """Return the verdict on a simulated sensor that measures ``seen_as @ xi`` of its true contact.
@@ -39,7 +42,23 @@ def _verdict(
         follow: share of the arm's shift along the surface with which a loose object follows it.
         turn: share of its turn about one axis, likewise.
         noise: factor on it.
+        slides_at_m: shear at which the contact slides.
     """
+    return _checked(seen_as, drift=drift, follow=follow, turn=turn, noise=noise, slides_at_m=slides_at_m, seed=seed)[0]
+
+
+def _checked(
+    seen_as: Array,
+    *,
+    drift: Array | None = None,
+    follow: float = 0.0,
+    turn: float = 0.0,
+    noise: float = 1.0,
+    slides_at_m: float = math.inf,
+    seed: int = 0,
+) -> tuple[str, list[float]]:
+    """Return the verdict, see there, and the true depth of each cycle, in mm."""
+    depths_mm = []
     rng = np.random.default_rng(seed)
     check = SensorCheck(1.0, press_mm=0.5, shift_mm=0.3, tilt_deg=1.0)
     T_b_s = se3.from_euler_mm_deg(np.array([100.0, 0.0, 50.0, 180.0, 0.0, 30.0]))
@@ -58,8 +77,13 @@ def _verdict(
         T_b_f = se3.compose(moved, T_b_f)
         if drift is not None:
             T_b_f = se3.compose(T_b_f, se3.exp(PERIOD_S * drift))
+        xi = se3.log(se3.compose(se3.inverse(T_b_s), T_b_f))
+        if (shear_m := float(np.linalg.norm(xi[:2]))) > slides_at_m:
+            xi[:2] *= slides_at_m / shear_m
+            T_b_f = se3.compose(T_b_s, se3.exp(xi))
+        depths_mm.append(1e3 * float(se3.inverse(se3.exp(xi))[2, 3]))
         cycle += 1
-    return check.verdict()
+    return check.verdict(), depths_mm
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -91,6 +115,30 @@ def test_estimates_that_follow_nothing_are_those_of_another_model() -> None:
 
 def test_surface_that_moves_evenly_is_no_fault_of_the_sensor() -> None:
     assert _verdict(np.eye(6), drift=np.array([5e-3, -3e-3, 0.0, 0.0, 0.0, 0.05])) == ""
+
+
+@pytest.mark.parametrize("turn_deg", [0.0, 90.0, 180.0, -120.0])
+@pytest.mark.parametrize("seed", range(3))
+def test_contact_that_is_dragged_until_it_slides_is_judged_by_its_tilt(turn_deg: float, seed: int) -> None:
+    drift = np.array([20e-3, 5e-3, 0.0, 0.0, 0.0, 0.0])
+    verdict = _verdict(_turn(turn_deg), drift=drift, slides_at_m=2e-3, seed=seed)
+    assert (verdict == "") == (turn_deg == 0.0)
+
+
+@pytest.mark.parametrize("turn_deg", [0.0, 180.0])
+@pytest.mark.parametrize("speed_mm_s", [-6.0, 0.0, 2.0])
+def test_depth_is_held_on_a_surface_that_rises_or_sinks(turn_deg: float, speed_mm_s: float) -> None:
+    """The depth is the same however the camera is turned."""
+    _, depths_mm = _checked(_turn(turn_deg), drift=np.array([0.0, 0.0, 1e-3 * speed_mm_s, 0.0, 0.0, 0.0]))
+    assert min(depths_mm) > 0.1
+    assert max(depths_mm) < 1.1 + abs(speed_mm_s) / 4.0
+
+
+def test_depth_that_a_model_does_not_tell_is_not_sought() -> None:
+    """Of one that tells a third of it, the surface seems to recede from the sensor that presses on."""
+    seen_as = np.diag([1.0, 1.0, 0.3, 1.0, 1.0, 1.0])
+    _, depths_mm = _checked(seen_as)
+    assert max(depths_mm) < 1.3
 
 
 @pytest.mark.parametrize("follow", [0.5, 1.0])
