@@ -104,6 +104,9 @@ class ServoState(Enum):
     FAULTED = auto()
 
 
+_SERVOING: Final = (ServoState.APPROACH, ServoState.SETTLE, ServoState.RUN)
+
+
 def servo_table(
     task: str,
     config: ServoConfig,
@@ -328,57 +331,65 @@ class ServoTask(MachineTask):
         if observation.operator_stop and not self._stop_seen:
             self._stop_seen = True
             self._machine.post(STOP, "operator")
-        servos = self._servos
         match self._machine.state:
             case ServoState.PREPARE:
                 self._prepare()
             case ServoState.APPROACH:
-                self._watch_sight(dt_s, blind=not all(servo.has_fresh_data for servo in servos))
-                searching = [servo for servo in servos if not servo.touches]
-                if stuck := next((servo.sensor for servo in servos if servo.contact_is_stuck), None):
-                    self._post(TRIP, f"{stuck}: its contact does not change while the arm moves")
-                elif not searching:
-                    self._post("contact")
-                elif max(servo.travelled_m() for servo in searching) >= 1e-3 * self._config.approach_distance_mm:
-                    self._post("no_contact", f"none within {self._config.approach_distance_mm:g} mm")
+                self._watch_approach(dt_s)
             case ServoState.CHECK:
                 self._watch_contact(dt_s)
                 if astray := self._astray(dt_s):
                     self._post("missed", astray)
                 self._watch_check()
             case ServoState.SETTLE:
-                self._watch_contact(dt_s)
-                steady = all(servo.only_touches or servo.steady() for servo in servos)
-                self._steady_s = self._steady_s + dt_s if steady else 0.0
-                if astray := self._astray(dt_s):
-                    self._post("missed", astray)
-                elif steady and self._steady_s >= self._config.settle_time_s:
-                    self._post("settled")
+                self._watch_settling(dt_s)
             case ServoState.RUN:
-                self._watch_contact(dt_s)
-                # Every servo processes the cycle, even if another one has already finished.
-                finished = [servo.advance(dt_s) for servo in servos]
-                if astray := self._astray(dt_s):
-                    self._post("missed", astray)
-                elif any(finished):
-                    shortfalls = [servo.run.shortfall() for servo in servos]
-                    if missed := next(filter(None, shortfalls), ""):
-                        self._post("missed", missed)
-                    else:
-                        self._post("finished")
-                elif any(run.wants_sidestep for run in self._sidestepping):
-                    self._post("aside", "the object is to be touched elsewhere")
+                self._watch_run(dt_s)
             case ServoState.RETURN:
-                self._watch_sight(dt_s, blind=not all(servo.has_fresh_data for servo in servos))
-                if all(servo.is_back() for servo in servos):
+                self._watch_motion(dt_s)
+                if all(servo.is_back() for servo in self._servos):
                     self._post("returned")
             case ServoState.SIDESTEP:
-                self._watch_sight(dt_s, blind=not all(servo.has_fresh_data for servo in servos))
-                if not any(servo.sidestepping for servo in servos):
+                self._watch_motion(dt_s)
+                if not any(servo.sidestepping for servo in self._servos):
                     self._post("placed")
             case ServoState.RETRACT:
-                if all(servo.travelled_m() >= 1e-3 * self._config.retract_mm for servo in servos):
+                if all(servo.travelled_m() >= 1e-3 * self._config.retract_mm for servo in self._servos):
                     self._post("retracted")
+
+    def _watch_approach(self, dt_s: float) -> None:
+        self._watch_motion(dt_s)
+        searching = [servo for servo in self._servos if not servo.touches]
+        if stuck := next((servo.sensor for servo in self._servos if servo.contact_is_stuck), None):
+            self._post(TRIP, f"{stuck}: its contact does not change while the arm moves")
+        elif not searching:
+            self._post("contact")
+        elif max(servo.travelled_m() for servo in searching) >= 1e-3 * self._config.approach_distance_mm:
+            self._post("no_contact", f"none within {self._config.approach_distance_mm:g} mm")
+
+    def _watch_settling(self, dt_s: float) -> None:
+        self._watch_contact(dt_s)
+        steady = all(servo.only_touches or servo.steady() for servo in self._servos)
+        self._steady_s = self._steady_s + dt_s if steady else 0.0
+        if astray := self._astray(dt_s):
+            self._post("missed", astray)
+        elif steady and self._steady_s >= self._config.settle_time_s:
+            self._post("settled")
+
+    def _watch_run(self, dt_s: float) -> None:
+        self._watch_contact(dt_s)
+        # Every servo processes the cycle, even if another one has already finished.
+        finished = [servo.advance(dt_s) for servo in self._servos]
+        if astray := self._astray(dt_s):
+            self._post("missed", astray)
+        elif any(finished):
+            shortfalls = [servo.run.shortfall() for servo in self._servos]
+            if missed := next(filter(None, shortfalls), ""):
+                self._post("missed", missed)
+            else:
+                self._post("finished")
+        elif any(run.wants_sidestep for run in self._sidestepping):
+            self._post("aside", "the object is to be touched elsewhere")
 
     def _astray(self, dt_s: float) -> str:
         """Return why a behavior cannot go on, by what its sensor touches; empty where all can."""
@@ -457,6 +468,10 @@ class ServoTask(MachineTask):
             blind=any(servo.T_base_sensor is None or servo.T_s_f is None for servo in self._servos),
         )
 
+    def _watch_motion(self, dt_s: float) -> None:
+        """Watch over a motion that needs no valid estimate."""
+        self._watch_sight(dt_s, blind=not all(servo.has_fresh_data for servo in self._servos))
+
     def _watch_sight(self, dt_s: float, *, blind: bool) -> None:
         self._blind_s = self._blind_s + dt_s if blind else 0.0
         if self._blind_s > self._config.stale_timeout_s:
@@ -467,28 +482,31 @@ class ServoTask(MachineTask):
 
     def _twists(self) -> list[tuple[ContactServo, Array]]:
         """Return the twist (6,) of each tool that moves in the current state."""
-        state = self._machine.state
+        c, servos, state = self._config, self._servos, self._machine.state
         if state is ServoState.RETRACT:
-            speed_m_s = -1e-3 * self._config.retract_speed_mm_s
-            return [(servo, servo.along_z(speed_m_s)) for servo in self._servos if servo.T_base_sensor is not None]
-        if state is ServoState.CHECK:
-            return self._check_twists()
-        if state is ServoState.RETURN:
-            if not all(servo.has_fresh_data for servo in self._servos):
-                return []
-            return [(servo, servo.way_back(1e-3 * self._config.approach_speed_mm_s)) for servo in self._servos]
-        if state is ServoState.PREPARE:
-            speed_m_s = -1e-3 * self._config.approach_speed_mm_s
-            backing = self._prepared is _Preparation.BACK_OFF and all(servo.has_fresh_data for servo in self._servos)
-            return [(servo, servo.along_z(speed_m_s)) for servo in self._servos if backing and servo.has_zero]
-        if state is ServoState.SIDESTEP:
-            if not all(servo.has_fresh_data for servo in self._servos):
-                return []
-            return [(servo, V) for servo in self._servos if (V := self._aside(servo)) is not None]
-        if state not in (ServoState.APPROACH, ServoState.SETTLE, ServoState.RUN):
+            speed_m_s = -1e-3 * c.retract_speed_mm_s
+            return [(servo, servo.along_z(speed_m_s)) for servo in servos if servo.T_base_sensor is not None]
+        if not all(servo.has_fresh_data for servo in servos):
+            for servo in servos if state in _SERVOING else ():
+                servo.controller.reset()
             return []
-        searching = state is ServoState.APPROACH
-        if not all(servo.has_fresh_data and (searching or servo.T_s_f is not None) for servo in self._servos):
+        match state:
+            case ServoState.CHECK:
+                return self._check_twists()
+            case ServoState.RETURN:
+                return [(servo, servo.way_back(1e-3 * c.approach_speed_mm_s)) for servo in servos]
+            case ServoState.PREPARE if self._prepared is _Preparation.BACK_OFF:
+                speed_m_s = -1e-3 * c.approach_speed_mm_s
+                return [(servo, servo.along_z(speed_m_s)) for servo in servos if servo.has_zero]
+            case ServoState.SIDESTEP:
+                return [(servo, V) for servo in servos if (V := self._aside(servo)) is not None]
+            case ServoState.APPROACH | ServoState.SETTLE | ServoState.RUN:
+                return self._servo_twists(state)
+        return []
+
+    def _servo_twists(self, state: Enum) -> list[tuple[ContactServo, Array]]:
+        searching, running = state is ServoState.APPROACH, state is ServoState.RUN
+        if not searching and any(servo.T_s_f is None for servo in self._servos):
             for servo in self._servos:
                 servo.controller.reset()
             return []
@@ -500,7 +518,6 @@ class ServoTask(MachineTask):
             elif (searching and self._unchecked and servo.is_estimated) or servo.only_touches:
                 V_tcp = None
             else:
-                running = state is ServoState.RUN
                 V_tcp = servo.servo_step(servo.run.feedforward if running else np.zeros(6), running=running)
             if V_tcp is not None:
                 twists.append((servo, V_tcp))
@@ -514,7 +531,7 @@ class ServoTask(MachineTask):
         return servo.step_aside(1e-3 * c.sidestep_speed_mm_s, 1e-3 * c.approach_speed_mm_s)
 
     def _check_twists(self) -> list[tuple[ContactServo, Array]]:
-        if not all(servo.has_fresh_data and servo.T_s_f is not None for servo in self._servos):
+        if any(servo.T_s_f is None for servo in self._servos):
             return []
         for check, servo in zip(self._checks, self._servos, strict=True):
             if not check.finished and servo.T_base_sensor is not None:
