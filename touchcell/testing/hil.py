@@ -23,12 +23,13 @@ if TYPE_CHECKING:
 
 _SHORT_MOVES = "and, if it is an arm, move about 10 mm along and 2 deg about every axis"
 _CONFIRMED = pytest.StashKey[set[str]]()
+_CELL = pytest.StashKey[Path | None]()
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Add ``--cell`` and ``--hil-yes``."""
     group = parser.getgroup("touchcell")
-    group.addoption("--cell", type=Path, help="cell file of the real devices on which `hil` tests run")
+    group.addoption("--cell", type=Path, help="cell file, or name of one that ships: `hil` tests run on its devices")
     group.addoption("--hil-yes", action="store_true", help="run `hil` tests without asking the operator")
 
 
@@ -36,8 +37,15 @@ def pytest_configure(config: pytest.Config) -> None:
     """Collect the cell file as one more test file."""
     config.addinivalue_line("markers", "hil: moves a real device; needs --cell")
     config.stash[_CONFIRMED] = set()
-    if cell := config.getoption("--cell"):
-        config.args.append(str(cell.resolve()))
+    config.stash[_CELL] = None
+    if given := config.getoption("--cell"):
+        from touchcell.cell.config.find import find_cell
+
+        cell = find_cell(given).resolve()
+        if not cell.is_file():
+            raise pytest.UsageError(f"--cell {given}: no such file, and no cell of that name ships (`touchcell list`)")
+        config.stash[_CELL] = cell
+        config.args.append(str(cell))
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
@@ -57,8 +65,7 @@ def is_generated(item: pytest.Item) -> bool:
 
 def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> pytest.Collector | None:
     """Collect the cell file as a module of suites."""
-    cell = parent.config.getoption("--cell")
-    if cell is None or file_path != cell.resolve():
+    if file_path != parent.config.stash[_CELL]:
         return None
     return CellModule.from_parent(parent, path=file_path)
 

@@ -15,7 +15,6 @@ import numpy as np
 from touchcell.cell.config.cell_plan import CellPlan, SensorSection
 from touchcell.control.interlocks.boundary import TiltConfig, WorkspaceConfig
 from touchcell.drivers.core.behaviour import ArmBehaviour
-from touchcell.drivers.kinematics.inverse import joints_for_pose
 from touchcell.errors import ConfigError
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
@@ -69,6 +68,8 @@ def start_of(plan: CellPlan, arm: str, given: Sequence[float] | None) -> Start:
         return Start(_six(wanted[0]), None)
     if not wanted:
         return Start(_six(chain.forward_and_jacobian(home)[0]), home)
+    from touchcell.drivers.kinematics.inverse import joints_for_pose
+
     reached: list[tuple[float, Start]] = []
     for T_base_tcp in wanted:
         try:

@@ -12,13 +12,13 @@ from touchcell.control.interlocks.clearance import ClearanceConfig
 from touchcell.control.interlocks.collision import BASE, TOOL, Box, Capsule
 from touchcell.control.interlocks.planning_scene import Body, PlanningScene
 from touchcell.drivers.core.protocols import ServoArm, TwistSink
-from touchcell.drivers.kinematics.chain import CapsuleShape, ChainDescription, DifferentialIk
 from touchcell.errors import ConfigError
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 
 if TYPE_CHECKING:
     from touchcell.cell.config.cell_plan import ArmSection, BoxSection, CapsuleSection, CellPlan
+    from touchcell.drivers.kinematics.chain import CapsuleShape, ChainDescription, DifferentialIk
 
 
 def build_planning_scene(plan: CellPlan, arms: Mapping[str, Any], names: Mapping[str, str]) -> PlanningScene:
@@ -57,6 +57,8 @@ def planned_scene(plan: CellPlan, role_of: Mapping[str, str]) -> PlanningScene:
     placed = {role: plan.cell.arms[name].T_world_base for name, role in role_of.items()}
     if not any(isinstance(entry, ClearanceConfig) for entry in plan.cell.interlocks.values()):
         return PlanningScene(placed)
+    from touchcell.drivers.kinematics.chain import DifferentialIk
+
     bodies = {}
     for name, role in role_of.items():
         if TwistSink in plan.arms[name].spec.capabilities.provides:

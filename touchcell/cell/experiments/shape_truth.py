@@ -1,16 +1,25 @@
-"""Rows of experiments with shapes: each with each estimator, some with truth sampled apart from what is declared."""
+"""Rows of following and tracking: each with each estimator, some with truth sampled apart from what is declared."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
 from typing import Any, Final
 
+REAL_TIP: Final = "franka_tactip_1"
+"""Tip that was fitted to the images of a real sensor."""
 SAMPLED: Final = "truth sampled"
 """Ends the names of rows in which nothing is quite what the controllers are told."""
 
 
-def sampled_truth(sensor: str, arm: str) -> dict[str, Any]:
-    """Return a ``truth:`` section: another mount, slip law, camera and delay than the cell file declares."""
+def sampled_truth(sensor: str, arm: str, tip: str | None = None) -> dict[str, Any]:
+    """Return a ``truth:`` section: another mount, slip law, camera and delay than the cell file declares.
+
+    Args:
+        sensor, arm: names in the cell file.
+        tip: name or file of another tip than the network was trained on, with its own camera; without it the camera
+            has moved a little.
+    """
+    camera = {"shift_px": [{"normal": [0, 0.3]}, {"normal": [0, 0.3]}]} if tip is None else {"tip": tip}
     return {
         "arms": {arm: {"latency_ms": {"uniform": [0, 10]}, "lag_ms": {"uniform": [2, 10]}}},
         "sensors": {
@@ -19,7 +28,7 @@ def sampled_truth(sensor: str, arm: str) -> dict[str, Any]:
                 "latency_ms": {"uniform": [5, 20]},
                 "noise": {"uniform": [1, 4]},
                 "exposure": {"uniform": [0.9, 1.1]},
-                "shift_px": [{"normal": [0, 0.3]}, {"normal": [0, 0.3]}],
+                **camera,
             }
         },
         "tip": {"slip_at_1mm_mm": {"uniform": [0.28, 0.4]}},

@@ -1,7 +1,8 @@
 """Surface following (paper 5.5): a straight line over a curved ramp, and eight paths down a dome, 45 degrees apart.
 
-Each path runs with the learned estimator and again on the true contact, which shows the error of control alone. Errors
-are of the true contact, so an estimation error counts by its effect on the arm.
+Each path runs with the learned estimator, on the true contact, which shows the error of control alone, and with the
+learned estimator where truth is sampled: the tip is one fitted to a real sensor, the network knows another. Errors are
+of the true contact, so an estimation error counts by its effect on the arm.
 """
 
 from __future__ import annotations
@@ -14,34 +15,40 @@ import numpy as np
 
 from touchcell.cell.analysis.run_folder import RunFolder, during, rms, tilt_deg, true_contacts
 from touchcell.cell.experiments.runner import ExperimentSpec, Scale
+from touchcell.cell.experiments.shape_truth import REAL_TIP, SAMPLED, sampled_truth
 from touchcell.cell.experiments.table import Column
 from touchcell.cell.experiments.trials import Finished, Trial
 
 DIRECTIONS_DEG = (0, 45, 90, 135, 180, 225, 270, 315)
 SENSOR = "sensor"
+ARM = "arm"
 ESTIMATORS = {"learned": None, "true contact": {"kind": "true_contact"}}
 
 
 def trials(scale: Scale) -> list[Trial]:
-    """Return trials of ramp and dome with both estimators, each repetition with other camera noise."""
-    paths: list[tuple[str, str, str, dict[str, Any]]] = [("ramp", "ramp", "surface_follow_sim.yaml", {})] + [
-        ("dome, 8 paths", f"dome_{angle}", "surface_follow_dome_sim.yaml", {"task.direction_deg": angle})
+    """Return trials of ramp and dome with both estimators, and with truth sampled.
+
+    Repetitions have other camera noise, and another truth where it is sampled.
+    """
+    paths: list[tuple[str, str, str, dict[str, Any], int]] = [("ramp", "ramp", "surface_follow_sim.yaml", {}, 10)] + [
+        ("dome, 8 paths", f"dome_{angle}", "surface_follow_dome_sim.yaml", {"task.direction_deg": angle}, 2)
         for angle in (DIRECTIONS_DEG[::4] if scale.quick else DIRECTIONS_DEG)
     ]
-    found = []
-    for estimator, section in ESTIMATORS.items():
-        chosen = {} if section is None else {f"sensors.{SENSOR}.estimator": section}
-        for row, name, cell, changes in paths:
-            found += [
-                Trial(
-                    f"{name}_{estimator.replace(' ', '_')}_{seed}",
-                    f"{row}, {estimator}",
-                    cell,
-                    {**changes, **chosen, "seed": seed},
-                )
-                for seed in range(1, scale.repetitions(1) + 1)
-            ]
-    return found
+    kinds: dict[str, dict[str, Any]] = {
+        estimator: {} if section is None else {f"sensors.{SENSOR}.estimator": section}
+        for estimator, section in ESTIMATORS.items()
+    } | {f"learned, {SAMPLED}": {"truth": sampled_truth(SENSOR, ARM, REAL_TIP)}}
+    return [
+        Trial(
+            f"{name}_{kind.replace(',', '').replace(' ', '_')}_{seed}",
+            f"{row}, {kind}",
+            cell,
+            {**changes, **more, "seed": seed},
+        )
+        for kind, more in kinds.items()
+        for row, name, cell, changes, repetitions in paths
+        for seed in range(1, scale.repetitions(repetitions) + 1)
+    ]
 
 
 def measure(trial: RunFolder) -> Mapping[str, float]:

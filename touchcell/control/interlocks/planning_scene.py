@@ -12,13 +12,13 @@ import numpy as np
 from touchcell.control.interlocks.collision import Box, Capsule
 from touchcell.control.interlocks.settings import InterlockSettings
 from touchcell.control.interlocks.snapshot import ArmView
-from touchcell.drivers.kinematics.chain import DifferentialIk
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 
 if TYPE_CHECKING:
     from touchcell.control.interlocks.interlock import Interlock
     from touchcell.control.interlocks.timers import TimedInterlock
+    from touchcell.drivers.kinematics.chain import DifferentialIk
 
 
 @dataclass(frozen=True, slots=True, eq=False)

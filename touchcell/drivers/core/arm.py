@@ -11,7 +11,7 @@ import logging
 from abc import abstractmethod
 from collections.abc import Iterable
 from contextlib import suppress
-from typing import Self, final
+from typing import TYPE_CHECKING, Self, final
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -34,11 +34,13 @@ from touchcell.drivers.core.protocols import StopCategory
 from touchcell.drivers.core.samples import Stamped, TcpState
 from touchcell.drivers.core.spec import DriverConfig
 from touchcell.drivers.kinematics.adjustment import Adjustment
-from touchcell.drivers.kinematics.chain import DifferentialIk, LocalIk
 from touchcell.drivers.kinematics.joint_limits import IkSettings
 from touchcell.geometry.finite import all_finite
 from touchcell.geometry.types import Array
 from touchcell.logs import OncePerCause
+
+if TYPE_CHECKING:
+    from touchcell.drivers.kinematics.chain import DifferentialIk, LocalIk
 
 _logger = logging.getLogger(__name__)
 

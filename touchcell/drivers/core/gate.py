@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -21,9 +21,11 @@ from touchcell.drivers.core.device import Lifecycle
 from touchcell.drivers.core.errors import CommandRejected, Rejection
 from touchcell.drivers.core.lease import Lease, LeaseManager
 from touchcell.drivers.kinematics.adjustment import Adjustment
-from touchcell.drivers.kinematics.chain import LocalIk
 from touchcell.geometry.finite import all_finite
 from touchcell.geometry.types import Array
+
+if TYPE_CHECKING:
+    from touchcell.drivers.kinematics.chain import LocalIk
 
 
 @dataclass(frozen=True, slots=True)

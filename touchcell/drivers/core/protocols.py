@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from enum import IntEnum
-from typing import Final, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Final, Protocol, runtime_checkable
 
 from touchcell.drivers.core.commands import Sent, TwistCommand
 from touchcell.drivers.core.gate import TwistLimits
 from touchcell.drivers.core.lease import Lease
 from touchcell.drivers.core.samples import Frame, JointState, Stamped, TcpState
-from touchcell.drivers.kinematics.chain import DifferentialIk
 from touchcell.geometry.types import Array
+
+if TYPE_CHECKING:
+    from touchcell.drivers.kinematics.chain import DifferentialIk
 
 
 class StopCategory(IntEnum):
