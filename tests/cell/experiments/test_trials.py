@@ -94,6 +94,15 @@ def test_a_trial_of_other_code_is_run_again_unless_stale_ones_are_kept(tmp_path)
     assert record["code"]["versions"]["numpy"]
 
 
+def test_why_reads_how_a_trial_ended(tmp_path):
+    from touchcell.cell.analysis.trip_report import explain
+
+    far = trial("far", **{"task.approach_distance_mm": 1})
+    (failed,) = perform_all(Perform(cycles, tmp_path), [far])
+    assert failed.outcome == "failed"
+    assert f"failed\n  {failed.reason}" in explain(tmp_path / "far", draw=False)
+
+
 def follow_file(folder: Path) -> Path:
     """A cell with a tip file of its own beside it."""
     from touchcell.simulation.tip_file import SHIPPED as TIPS

@@ -17,11 +17,11 @@ from touchcell.cell.errors import RecordingError
 from touchcell.cell.recording.mcap import RECORDING
 from touchcell.cell.runtime.black_box import ABOUT, CRASH, MESSAGES, RING, read_left_ring
 from touchcell.cell.runtime.operator_input import is_running
+from touchcell.cell.runtime.result_record import RESULT
 from touchcell.cell.runtime.watchdog import NOTES
 from touchcell.errors import ConfigError
 from touchcell.geometry.types import Array
 
-RESULT: Final = "result.json"
 BEFORE_S: Final = 1.0
 """How much of the time before the trip is shown."""
 _EVENTS: Final = 5

@@ -8,7 +8,7 @@ import json
 import logging
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,13 +23,14 @@ from touchcell.cell.config.worlds import WorldName
 from touchcell.cell.recording.mcap import RECORDING
 from touchcell.cell.recording.recorder import Recorder
 from touchcell.cell.recording.reserved_file import ReservedFile
-from touchcell.cell.runtime.black_box import BlackBox, cause_record, keep_earlier, note_crashes, stop_record
+from touchcell.cell.runtime.black_box import BlackBox, keep_earlier, note_crashes
 from touchcell.cell.runtime.cell import Cell
 from touchcell.cell.runtime.compose import compose
 from touchcell.cell.runtime.heap import trim_heap
 from touchcell.cell.runtime.loop import RunLoop
 from touchcell.cell.runtime.operator_channel import OperatorChannel
 from touchcell.cell.runtime.operator_input import stop_on_keys, stop_on_signals
+from touchcell.cell.runtime.result_record import RESULT, not_started_record, result_record
 from touchcell.cell.runtime.run_directory import RunFolderError, run_directory
 from touchcell.cell.runtime.run_result import Outcome, Progress, RunResult
 from touchcell.cell.runtime.stop_request import StopRequest
@@ -178,7 +179,7 @@ def run_plan(
             with _page(folder, page_port, moves=operator.jog_input is not None):
                 result, leaving = _run(cell, folder, live, result_file, live_port, operator)
         except Exception as error:
-            _write_result(result_file, _not_started_json(plan, error))
+            _write_result(result_file, not_started_record(plan, error))
             raise
         ended = f"{result.outcome.value} after {result.duration_s:.2f} s"
         logger.info("%s: %s%s", plan.cell.name, ended, f" ({result.reason})" if result.reason else "")
@@ -199,7 +200,7 @@ def _log_and_result(folder: Path, plan: CellPlan) -> Iterator[ReservedFile]:
     """Put the cell file and a log into the run folder, and take the room for ``result.json``."""
     try:
         (folder / "cell.yaml").write_text(plan.text())
-        result_file = ReservedFile(folder / "result.json")
+        result_file = ReservedFile(folder / RESULT)
     except OSError as error:
         raise RunFolderError(folder, f"cannot be written: {error.strerror}") from None
     with log_to_file(folder / LOG):
@@ -236,7 +237,7 @@ def _run(
             raise
         logger.exception("after the run")
         warn(f"after the run: {error}")
-        _write_result(result_file, {**_result_json(cell.plan, result), "after_the_run": str(error)})
+        _write_result(result_file, {**result_record(cell.plan, result), "after_the_run": str(error)})
         return result, error
     return result, None
 
@@ -284,7 +285,7 @@ def _running(
         def run() -> RunResult:
             result = loop.run()
             # Before the devices are given back, which an arm that obeys nothing may not survive.
-            _write_result(result_file, _result_json(cell.plan, result))
+            _write_result(result_file, result_record(cell.plan, result))
             nonlocal explained
             explained = result.outcome is Outcome.DONE or loop.has_waited or _dump(box, folder, cell, result)
             if result.outcome is Outcome.TRIPPED:
@@ -393,36 +394,3 @@ def _live_line(plan: CellPlan, live: bool) -> Iterator[Any]:
         # A terminal that is gone needs no last line.
         with contextlib.suppress(OSError, ValueError):
             display.stop()
-
-
-def _result_json(plan: CellPlan, result: RunResult) -> dict[str, Any]:
-    return {
-        "cell": plan.cell.name,
-        "task": plan.task.name,
-        "outcome": result.outcome.value,
-        "reason": result.reason,
-        "state": result.state,
-        "duration_s": round(result.duration_s, 6),
-        "cycles": result.cycles,
-        "stops": {role: stop_record(report) for role, report in result.stops.items()},
-        "resets": [
-            {"operator": reset.operator, "causes": [cause_record(cause) for cause in reset.causes]}
-            for reset in result.resets
-        ],
-        "skipped": list(plan.skipped),
-        "stages_us": {stage: _quantiles_us(rows) for stage, rows in result.times.rows.items()},
-    }
-
-
-def _not_started_json(plan: CellPlan, error: Exception) -> dict[str, Any]:
-    """The result of a run whose task never started."""
-    return {"cell": plan.cell.name, "task": plan.task.name, "outcome": Outcome.ERROR.value, "reason": str(error)}
-
-
-def _quantiles_us(rows: Iterable[int]) -> dict[str, float]:
-    ordered = sorted(rows)
-    return {
-        "median": round(ordered[len(ordered) // 2] * 1e-3, 1),
-        "p99": round(ordered[min(len(ordered) - 1, round(0.99 * len(ordered)))] * 1e-3, 1),
-        "count": len(ordered),
-    }

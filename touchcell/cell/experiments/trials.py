@@ -30,6 +30,7 @@ from touchcell.cell.errors import RecordingError
 from touchcell.cell.recording.recorder import Recorder
 from touchcell.cell.runtime.compose import compose
 from touchcell.cell.runtime.loop import RunLoop
+from touchcell.cell.runtime.result_record import RESULT, result_record
 from touchcell.cell.runtime.run_result import Outcome
 from touchcell.errors import ConfigError, TouchcellError, suggest
 from touchcell.paths import CONFIGS
@@ -153,7 +154,7 @@ class Perform:
         """As ``__call__``, of cell file content ``data`` in place of the trial's own."""
         folder = self.root / trial.name
         folder.mkdir(parents=True, exist_ok=True)
-        for name in ("trial.json", LOG):
+        for name in ("trial.json", RESULT, LOG):
             (folder / name).unlink(missing_ok=True)
         try:
             data = trial.cell_data() if data is None else data
@@ -209,6 +210,7 @@ class Perform:
         cell = compose(plan)
         with Recorder(folder / "run.mcap") as recorder, cell:
             result = RunLoop(cell, recorder).run()
+        write_whole(folder / RESULT, json.dumps(result_record(plan, result), indent=1))
         measures = self.measure(RunFolder(folder)) if result.cycles else {}
         record = {
             "settings": settings,
