@@ -147,6 +147,13 @@ def test_out_of_range_is_tolerated_for_a_while() -> None:
     assert evaluate(interlock, [sensor_cycle(k, in_range=k % 5 == 0) for k in range(40)]) == [None] * 40
 
 
+def test_a_frame_that_was_refused_trips_with_its_reason() -> None:
+    interlock = rule(kind="out_of_range", limit_ms=50)
+    cycles = [sensor_cycle(k, in_range=False, refusal="the markers do not move as those of one tip") for k in range(10)]
+    violation = next(filter(None, evaluate(interlock, cycles)))
+    assert "the markers do not move as those of one tip" in str(violation)
+
+
 def test_tracking_error_is_measured_against_the_sent_command() -> None:
     interlock = rule(kind="tracking", limit_mm_s=5, hold_ms=30)
     good = evaluate(interlock, [arm_cycle(k, vx_mm_s=20, sent_mm_s=24) for k in range(20)])

@@ -172,7 +172,8 @@ _REMEDIES: Final = {
     "estimate itself jumps, train the estimator on more images",
     "workspace": "if the task was right to go there, make the box larger; if not, look at its start and its target",
     "depth": "lower the task's depth or gains, or approach more slowly",
-    "out_of_range": "press less deep and less slanted, or train the estimator on the contacts that occur",
+    "out_of_range": "press less deep and less slanted, or train the estimator on the contacts that occur; where the "
+    "markers do not move as those of one tip, adapt the model to this tip (`touchcell adapt`)",
     "frame_age": "find what delays the camera or the cycle (budget.png); raise the limit only if the arm is slow",
     "arm_state_age": "find what delays the arm's states or the cycle (budget.png)",
     "tcp_speed": "lower the task's speeds or gains; the limit is for the tool, with the turn about it",

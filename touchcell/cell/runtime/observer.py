@@ -194,4 +194,5 @@ def _sensor_view(estimate: ContactEstimate, sensor: Sensor) -> SensorView:
         None if estimate.belief is None else estimate.belief.mean,
         estimate.markers,
         sensor.arm_role,
+        estimate.refusal,
     )

@@ -65,6 +65,7 @@ class SensorView:
         T_s_f: (4, 4) estimated pose of the surface in the sensor's frame; None without contact.
         markers: fraction of the markers expected in view that are detected; None for an estimator without markers.
         arm: role of the arm that carries it; None for a fixed sensor.
+        refusal: why the frame does not show a contact as the model's camera would; empty where it does.
     """
 
     t_frame_ns: int
@@ -81,6 +82,7 @@ class SensorView:
     T_s_f: Array | None = None
     markers: float | None = None
     arm: str | None = None
+    refusal: str = ""
 
 
 @dataclass(frozen=True, slots=True)

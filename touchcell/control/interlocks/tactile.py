@@ -187,7 +187,11 @@ class _ShearPerDepth:
 
 
 def _out_of_range(view: CellView) -> Mapping[str, str]:
-    return {role: "outside the training range" for role, sensor in view.sensors.items() if not sensor.in_range}
+    return {
+        role: sensor.refusal or "outside the training range"
+        for role, sensor in view.sensors.items()
+        if not sensor.in_range
+    }
 
 
 class FrameFrozenConfig(InterlockSettings):
