@@ -2,9 +2,9 @@
 
 For each cell and world: how the run ended, how long it took, the depth that was felt against what was wanted, the
 median time from exposure to command, and the share of control cycles that came late. Where a cell ran in both worlds,
-how far apart the tools were while the task was at work: RMS at equal times from its begin, the time shift of the
-emulated motion that brings them closest, and RMS after it. A lag of ``t`` s at ``v`` mm/s shows as ``v t``. For the
-bench the file is checked, and nothing is connected.
+how far apart the tools were while the task was at work: RMS at equal times from the begin of each visit to that state,
+the time shift of the emulated motion that brings them closest, and RMS after it. A lag of ``t`` s at ``v`` mm/s shows
+as ``v t``. For the bench the file is checked, and nothing is connected.
 """
 
 from __future__ import annotations
@@ -14,12 +14,13 @@ import json
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from touchcell.cell.analysis.run_data import Run, load_run
 from touchcell.cell.bench.provenance import provenance
@@ -41,6 +42,9 @@ _COLUMNS: Final = (
     f"{'cell':<24}{'world':<10}{'ended':<9}{'after s':>8}{'depth mm':>10}{'error RMS':>10}{'latency ms':>11}"
     f"{'late %':>7}{'apart mm':>10}{'shift ms':>9}{'then mm':>8}"
 )
+
+
+Ways: TypeAlias = Mapping[str, Sequence[Array]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,34 +156,45 @@ def _depths(recording: Run) -> Array:
     return found
 
 
-def _ways(recording: Run) -> dict[str, Array]:
-    """Return by arm (n, 4) [t s, x y z mm] of its tool while the task was at work, from its begin."""
+def _ways(recording: Run) -> Ways:
+    """Return by arm the ways of its tool in each of the task's visits to the state in which it is at work."""
     found = {}
     for role in recording.roles("arms", "tcp"):
         tcp = recording.series(f"/arms/{role}/tcp")
         assert tcp is not None
+        rows = np.column_stack([tcp.t_s, tcp.poses()[:, :3]])
         for state in _WORK:
-            inside = recording.during(tcp.t_s, state)
-            if inside.any():
-                rows = np.column_stack([tcp.t_s, tcp.poses()[:, :3]])[inside]
-                rows[:, 0] -= rows[0, 0]
-                found[role] = rows
+            if visits := visits_to(rows, recording.during(tcp.t_s, state)):
+                found[role] = visits
                 break
     return found
 
 
-def apart(one: dict[str, Array], other: dict[str, Array]) -> Apart | None:
-    """Return how far the ways of the tools were apart; None where no tool moved in both.
+def visits_to(rows: Array, inside: NDArray[np.bool_]) -> list[Array]:
+    """Return each stretch of consecutive rows (n, 4) [t s, x y z mm] that are ``inside`` (n,), from its own begin on.
+
+    A task may come back to a state, later in one world than in the other.
+    """
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], inside, [False]]).astype(np.int8)))
+    visits = [rows[first:last].copy() for first, last in edges.reshape(-1, 2)]
+    for visit in visits:
+        visit[:, 0] -= visit[0, 0]
+    return visits
+
+
+def apart(one: Ways, other: Ways) -> Apart | None:
+    """Return how far the ways of the tools were apart, visit by visit; None where no tool moved in both.
 
     Args:
-        one, other: by arm (n, 4) [t s, x y z mm].
+        one, other: by arm its visits, (n, 4) [t s, x y z mm] each.
     """
-    roles = one.keys() & other.keys()
-    if not roles:
+    pairs = [pair for role in one.keys() & other.keys() for pair in zip(one[role], other[role], strict=False)]
+    pairs = [(a, b) for a, b in pairs if min(a[-1, 0], b[-1, 0]) > 2.0 * _SHIFTS_S[-1]]
+    if not pairs:
         return None
-    found = [_rms_mm([(one[role], other[role]) for role in roles], shift_s) for shift_s in _SHIFTS_S]
+    found = [_rms_mm(pairs, shift_s) for shift_s in _SHIFTS_S]
     best = int(np.argmin(found))
-    return Apart(_rms_mm([(one[role], other[role]) for role in roles], 0.0), float(_SHIFTS_S[best]), found[best])
+    return Apart(_rms_mm(pairs, 0.0), float(_SHIFTS_S[best]), found[best])
 
 
 def _rms_mm(ways: Sequence[tuple[Array, Array]], shift_s: float) -> float:
