@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from touchcell.cell.analysis.run_data import load_run
+from touchcell.cell.bench.jogged import jog_run
 from touchcell.cell.bench.worlds import apart, visits_to
+from touchcell.cell.recording.mcap import RECORDING
+from touchcell.cell.runtime.run_result import Outcome
 from touchcell.geometry.types import Array
+from touchcell.paths import CONFIGS
 
 
 def way(begin_s: float, end_s: float, late_s: float = 0.0, aside_mm: float = 0.0) -> Array:
@@ -43,3 +50,14 @@ def test_visits_that_are_over_at_once_are_not_compared() -> None:
     assert visits_to(way(0.0, 1.0), np.zeros(50, dtype=bool)) == []
     assert apart({"arm": [way(0.0, 0.1)]}, {"arm": [way(0.0, 0.1)]}) is None
     assert apart({"arm": [way(0.0, 1.0)]}, {"other": [way(0.0, 1.0)]}) is None
+
+
+def test_a_cell_is_jogged_by_a_script_until_it_touches_and_away_again(tmp_path: Path) -> None:
+    result = jog_run(CONFIGS / "surface_follow_bench.yaml", "sim", tmp_path)
+    assert (result.outcome, result.reason) == (Outcome.DONE, "operator")
+    task = load_run(tmp_path / RECORDING).series("/task")
+    assert task is not None
+    states = [row["state"] for row in task.rows]
+    visited = [state for state, before in zip(states, [None, *states], strict=False) if state != before]
+    held = ["moving", "idle", "moving", "idle", "until_touch", "release", "idle", "backing_off", "release", "idle"]
+    assert visited == ["idle", *held, "done"]
