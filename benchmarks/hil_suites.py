@@ -26,7 +26,10 @@ from touchcell.cell.bench.provenance import provenance
 from touchcell.cell.config.find import find_cell
 
 _CELLS: Final = ("surface_follow_bench.yaml", "dual_push_bench.yaml", "steps_damiao_bench.yaml")
-_COLUMNS: Final = f"{'cell':<24}{'world':<10}{'pace':>5}{'passed':>8}{'failed':>8}{'skipped':>9}{'repeated':>10}{'minutes':>9}{'load':>7}"
+_COLUMNS: Final = (
+    f"{'cell':<24}{'world':<10}{'pace':>5}{'passed':>8}{'failed':>8}{'skipped':>9}"
+    f"{'repeated':>10}{'minutes':>9}{'load':>7}"
+)
 
 
 def run(arguments: Sequence[str], out: Path) -> None:

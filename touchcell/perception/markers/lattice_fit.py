@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from touchcell.geometry.types import Array
 from touchcell.perception.markers.detection import Discs, lattice, ring_numbers
@@ -36,7 +37,7 @@ def fit_lattice(discs: Discs, rings: int) -> tuple[Array, float]:
     for turn in np.arange(12) * np.pi / 36:
         placed = complex(*centre) + reach * np.exp(1j * turn) * z
         for used, within, steps in ((2, 0.8, 6), (4, 0.4, 10)):
-            before: tuple[Array, Array] | None = None
+            before: tuple[NDArray[np.bool_], NDArray[np.intp]] | None = None
             for _ in range(steps):
                 points = np.column_stack([placed.real, placed.imag])
                 partner, paired = pair(points, centres, within * reach / rings)
