@@ -47,9 +47,8 @@ def run(arguments: Sequence[str], out: Path) -> None:
     for cell in options.cells or _CELLS:
         ups = [_processor_s(partial(_up, cell)) for _ in range(options.times)]
         faults = [_processor_s(partial(_fault, cell)) for _ in range(max(1, options.times // 3))]
-        row = {"cell": cell, "first_s": ups[0], "up_s": _figures(ups[1:] or ups), "fault_s": _figures(faults)}
-        rows.append(row)
-        up, fault = row["up_s"], row["fault_s"]
+        up, fault = _figures(ups[1:] or ups), _figures(faults)
+        rows.append({"cell": cell, "first_s": ups[0], "up_s": up, "fault_s": fault})
         figures = f"{ups[0]:>10.2f}{up['best']:>7.2f}{up['median']:>8.2f}{fault['best']:>13.2f}{fault['median']:>8.2f}"
         print(f"{cell:<30}{figures}", flush=True)
     (out / "cell_fixture.json").write_text(json.dumps({**provenance(), "rows": rows}, indent=1) + "\n")
