@@ -28,6 +28,7 @@ BENCHMARKS = {
     "live": "benchmarks.live",
     "mutation": "benchmarks.mutation",
     "hil-mutation": "benchmarks.hil_mutation",
+    "hil-suites": "benchmarks.hil_suites",
     "phantom": "benchmarks.phantom",
     "pushes": "benchmarks.pushes",
     "recipe": "benchmarks.recipe",
@@ -40,6 +41,7 @@ BENCHMARKS = {
     "structure": "benchmarks.structure",
     "soak": "tests.fault_injection.soak",
     "tuning": "benchmarks.tuning",
+    "cell-fixture": "benchmarks.cell_fixture",
     "world-faults": "benchmarks.world_faults",
 }
 

@@ -5,8 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
+
+import yaml
 
 BUILTIN = "builtin:"
+
+# The loader in C, where it was built, is ten times as fast.
+_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 def _none() -> Mapping[str, Path]:
@@ -42,3 +48,8 @@ class InputFile:
 def files_in(folder: Path, suffix: str) -> Callable[[], Mapping[str, Path]]:
     """Return what finds the files of ``folder`` that end in ``suffix``, by their names without it."""
     return lambda: {path.name.removesuffix(suffix): path for path in sorted(folder.glob(f"*{suffix}"))}
+
+
+def read_yaml(path: Path) -> Any:
+    """Return the content of a YAML file of data; builds no objects. Raises OSError, UnicodeDecodeError, YAMLError."""
+    return yaml.load(path.read_text(encoding="utf-8"), _LOADER)

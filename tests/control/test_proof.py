@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Literal
 
@@ -108,8 +108,39 @@ def test_it_has_to_trip_in_every_state_of_the_task() -> None:
     proof = proven(ProvableConfig(), Bright(200.0, states=("settle",)))
     assert proof.tripped_s is None
     assert "in run" in proof.problem
-    interlock = Bright(200.0)
+    interlock = Bright(200.0, states=("settle", "run"))
     proven(ProvableConfig(), interlock)
+    assert {view.task_state for view in interlock.seen} == {"settle", "run"}
+
+
+def test_one_that_never_asks_for_the_state_is_shown_one() -> None:
+    interlock = Bright(200.0)
+    assert proven(ProvableConfig(), interlock).problem == ""
+    assert {view.task_state for view in interlock.seen} == {"settle"}
+
+
+@pytest.mark.parametrize(
+    "derive", [lambda view: replace(view, at_work=True), lambda view: with_sensor(view, "sensor", markers=1.0)]
+)
+def test_one_that_asks_a_snapshot_derived_from_its_own_is_shown_every_state(
+    derive: Callable[[CellView], CellView],
+) -> None:
+    def judge(view: CellView) -> Violation | None:
+        derived = derive(view)
+        bright = derived.sensors["sensor"].brightness is not None
+        trips = bright and derived.task_state == "settle"
+        return Violation("it", Severity.TRIP, "sensor", "too bright", view.now_ns) if trips else None
+
+    assert "does not trip within 2 s in run" in proven(ProvableConfig(), Bright(200.0, judge=judge)).problem
+
+
+def test_a_fault_that_names_its_states_is_shown_in_each_of_them() -> None:
+    class Glare(BrightConfig):
+        def faults(self, facts: CellFacts) -> Iterable[Fault | CannotTrip]:
+            yield Fault("sensor", "glare", "200", partial(_glare, "sensor", 210.0), states=("settle", "run"))
+
+    interlock = Bright(200.0)
+    assert proven(Glare(), interlock).problem == ""
     assert {view.task_state for view in interlock.seen} == {"settle", "run"}
 
 

@@ -6,9 +6,10 @@ See docs/explanation/armed-coverage.md.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cache
 from itertools import count
+from typing import Any
 
 from touchcell.control.interlocks.coverage import CannotTrip, CellFacts, Fault, Provable
 from touchcell.control.interlocks.interlock import Interlock
@@ -23,6 +24,27 @@ _Healthy = Callable[[int, str], CellView]
 
 _START_NS = 10**12
 _HEALTHY_CYCLES = 2
+
+
+class _Watched(CellView):
+    """A snapshot that notes in ``asked`` for which states of the task it was asked."""
+
+    __slots__ = ("asked",)
+
+    asked: set[str]
+
+    @classmethod
+    def of(cls, view: CellView, asked: set[str]) -> _Watched:
+        watched = cls(**{each.name: getattr(view, each.name) for each in fields(view)})
+        object.__setattr__(watched, "asked", asked)
+        return watched
+
+    def __getattribute__(self, name: str) -> Any:
+        value = super().__getattribute__(name)
+        # What an interlock derives from it with `replace` has no notes: deriving it has asked already.
+        if name == "task_state" and hasattr(self, "asked"):
+            self.asked.add(value)
+        return value
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,11 +114,15 @@ def _proof(
         return Proof(name, kind, case.subject, problem=case.reason, key=case.key, hint=case.hint, fatal=case.fatal)
     slowest_s = 0.0
     problem = ""
+    asked: set[str] = set()
     for state in case.states or facts.states or ("",):
-        tripped_s, problem = _shown(name, case, interlock, facts.period_s, healthy, state)
+        tripped_s, problem = _shown(name, case, interlock, facts.period_s, healthy, state, asked)
         if tripped_s is None:
             break
         slowest_s = max(slowest_s, tripped_s)
+        if not (asked or case.states):
+            # The same fault before an interlock that has not asked for the state ends the same way in all of them.
+            break
     return Proof(
         name,
         kind,
@@ -113,9 +139,18 @@ def _proof(
 
 
 def _shown(
-    name: str, fault: Fault, interlock: Interlock | TimedInterlock, period_s: float, healthy: _Healthy, state: str
+    name: str,
+    fault: Fault,
+    interlock: Interlock | TimedInterlock,
+    period_s: float,
+    healthy: _Healthy,
+    state: str,
+    asked: set[str],
 ) -> tuple[float | None, str]:
-    """Return the time from the fault to the trip in one state of the task, and why there was none."""
+    """Return the time from the fault to the trip in one state of the task, and why there was none.
+
+    The state is added to ``asked`` if the interlock asks for it.
+    """
     latch = unlogged_latch()
     supervisor = Supervisor([interlock], latch)
     period_ns = max(1, round(1e9 * period_s))
@@ -131,7 +166,7 @@ def _shown(
             view = (fault.before if k < 0 else fault.change)(view, t_s)
         except Exception as error:
             return None, f"{fault.what}: cannot be shown{_in(state)}: {error!r}"
-        supervisor.review(view)
+        supervisor.review(_Watched.of(view, asked))
         causes = latch.causes
         if not causes:
             continue

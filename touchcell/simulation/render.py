@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Protocol, cast
 
 import numpy as np
@@ -60,10 +61,17 @@ class Stamps:
             coverage += np.clip(np.minimum(across + 0.5, half) - np.maximum(across - 0.5, -half), 0.0, 1.0)
         coverage *= 255.0 / _ROWS
         self.stamps = np.round(coverage).astype(np.uint8)
+        self.stamps.setflags(write=False)
 
     def paint(self, image: ImageArray, centres: Array) -> None:
         """Draw white discs at ``centres`` (n, 2) px into a grey ``image``, clipped at its border."""
         _kernels.paint(image, np.ascontiguousarray(centres, dtype=np.float64), self.stamps)
+
+
+@lru_cache(maxsize=8)
+def _stamps(radius_px: float) -> Stamps:
+    """Return the stamps of one radius, read-only: sensors of one kind share them."""
+    return Stamps(radius_px)
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +107,7 @@ class FrameRenderer:
     def __init__(self, disc_radius_px: float = 6.2, lighting: Lighting | None = None, seed: Seed = 0) -> None:
         light = lighting or Lighting()
         width, height = FRAME_SIZE
-        self._stamps = Stamps(disc_radius_px)
+        self._stamps = _stamps(disc_radius_px)
         v, u = np.mgrid[:height, :width]
         corner = math.hypot(width, height) / 2.0
         fade = 1.0 - light.vignetting * ((u - width / 2.0) ** 2 + (v - height / 2.0) ** 2) / corner**2

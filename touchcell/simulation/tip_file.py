@@ -11,6 +11,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from touchcell.errors import ConfigError, suggest
+from touchcell.input_file import read_yaml
 from touchcell.simulation.mount import MountModel
 from touchcell.simulation.tip import TipParameters
 
@@ -55,7 +56,7 @@ def load_tip(name: str) -> TipFile:
     shipped = SHIPPED / f"{name}.yaml"
     path = shipped if os.path.isfile(shipped) else Path(name)
     try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+        data = read_yaml(path)
         return TipFile.model_validate(data)
     except OSError as error:
         known = ", ".join(sorted(each.stem for each in SHIPPED.glob("*.yaml")))

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import yaml
 
-from touchcell.cell.config.armed import cell_facts, proof_table, prove_cell, require_armed
+from touchcell.cell.config.armed import advised, cell_facts, proof_table, prove_cell, require_armed
 from touchcell.cell.config.cell_plan import CellPlan
 from touchcell.cell.config.schema import plan_cell
 from touchcell.cell.config.yaml_file import InvalidCell
@@ -580,3 +580,18 @@ def test_every_shipped_cell_that_moves_by_images_trips_on_frozen_and_badly_expos
         return
     kinds = {each.kind for each in plan.cell.interlocks.values()}
     assert kinds >= {"frame_frozen", "exposure"}
+    assert not list(advised(plan))
+
+
+def test_a_cell_that_moves_by_images_is_advised_what_tells_of_frozen_and_dark_ones(tmp_path: Path) -> None:
+    data = two_arms()
+    assert not any("advice" in note for note in planned(data, tmp_path).notes)
+    drop(data, "exposure")
+    assert planned(data, tmp_path).notes[0] == (
+        "advice   follower_sensor, leader_sensor: nothing trips when its images turn dark or bright: add exposure"
+    )
+    drop(data, "frozen_frame")
+    assert "freeze or turn dark or bright: add frame_frozen and exposure" in planned(data, tmp_path).notes[0]
+    data["interlocks"]["exposure"] = {"kind": "exposure", "limit_percent": 15}
+    true_contact(data)
+    assert not any("advice" in note for note in planned(data, tmp_path).notes)

@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import os
 import pty
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
 
+from touchcell.cell.config.addresses import clashes
 from touchcell.cell.config.layers import explain, load_layers
 from touchcell.cell.config.schema import EMULATED_CAMERAS, plan_cell, plan_in_world
+from touchcell.cell.config.worlds import WorldName
+from touchcell.cell.config.yaml_file import InvalidCell
+from touchcell.cell.runtime.bench_lock import addresses
 from touchcell.drivers.core.bench_address import is_pseudo_terminal, is_virtual_can
 from touchcell.drivers.core.spec import DRIVERS
 from touchcell.errors import ConfigError
@@ -169,3 +174,84 @@ def test_a_driver_without_behaviour_is_named_where_it_would_be_simulated(
     monkeypatch.setattr("touchcell.drivers.ur.driver.SPEC", replace(real, behaviour=None))
     with pytest.raises(ConfigError, match="does not describe how its device behaves"):
         plan_in_world(bench, "sim", settings={"arms.arm.start_pose_mm_deg": [490, -150, 400, 180, 0, 0]})
+
+
+PLATE = "surfaces: {part: {kind: mesh, file: %s, unit: mm, pose_mm_deg: [490, -150, 360, 0, 0, 0]}}\n"
+
+
+@pytest.mark.parametrize("world", ["sim", "emulated"])
+@pytest.mark.parametrize("key", ["scene", "emulated_scene", None])
+def test_files_of_a_scene_are_relative_to_the_file_that_names_them_in_every_world(
+    bench: Path, tmp_path: Path, world: WorldName, key: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "cells").mkdir()
+    (tmp_path / "cells" / "part.stl").write_bytes((CONFIGS / "meshes" / "hill.stl").read_bytes())
+    cell = tmp_path / "cells" / "mine.yaml"
+    own = "" if key is None else f"{key}:\n  {PLATE % 'part.stl'}"
+    cell.write_text(f"extends: ../bench.yaml\nname: mine\n{own}")
+    if key is None:
+        cell.with_name("mine.scene.yaml").write_text(PLATE % "part.stl")
+    monkeypatch.chdir("/")
+    planned = plan_in_world(cell, world).cell
+    scene = planned.scene if world == "sim" else planned.emulated_scene
+    assert scene is not None
+    assert scene["surfaces"]["part"]["file"] == str(tmp_path / "cells" / "part.stl")
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "key", "words"),
+    [
+        (PLATE % "gone.stl", 1, "surfaces.part.file", "no such file"),
+        ("step_ms: 5\nsurfaces: {part: {kind: plain}}\n", 2, "surfaces.part.kind", "plain"),
+        ("start_pose_mm_deg: {arn: [0, 0, 0, 0, 0, 0]}\n", 1, "start_pose_mm_deg.arn", "no arm"),
+        ("start_pose_mm_deg:\n  arm: [1, 2, 3]\n", 2, "start_pose_mm_deg.arm", "six numbers"),
+        ("start_pose_mm_deg: {arm: [3000, 0, 0, 0, 0, 0]}\n", 0, "start_pose_mm_deg.arm", "start pose [3000.0,"),
+    ],
+)
+def test_a_mistake_in_the_scene_beside_the_file_is_named_with_that_file(
+    bench: Path, text: str, line: int, key: str, words: str
+) -> None:
+    bench.with_name("bench.scene.yaml").write_text(text)
+    with pytest.raises(ConfigError) as caught:
+        plan_in_world(bench, "sim")
+    error = caught.value.problems[0] if isinstance(caught.value, InvalidCell) else caught.value
+    assert (Path(error.file).name, error.line) == ("bench.scene.yaml", line)
+    assert error.key == key
+    assert words in error.reason
+
+
+def test_devices_that_nothing_simulates_are_left_out_with_the_reason_where_no_task_needs_them(bench: Path) -> None:
+    bench.write_text(bench.read_text() + "devices:\n  gripper: {driver: robotiq, port: /dev/ttyUSB0}\n")
+    plan = plan_in_world(bench, "sim")
+    assert "gripper: left out, as nothing simulates a gripper" in plan.notes
+    assert "gripper" in plan.skipped
+    assert "gripper" not in plan.built
+    assert not any("gripper" in note for note in plan_in_world(bench, "bench").notes)
+
+
+@pytest.mark.parametrize("world", [None, "sim", "emulated", "bench"])
+def test_two_devices_at_one_address_are_refused_by_their_keys(world: WorldName | None) -> None:
+    settings = {
+        "arms.leader": {**yaml.safe_load(BENCH.read_text())["arms"]["arm"], "host": "192.168.1.10"},
+        "arms.follower.host": "192.168.1.10",
+        "sensors.leader_sensor.device": "/dev/null",
+        "sensors.follower_sensor.device": "/dev/../dev/null",
+    }
+    with pytest.raises(InvalidCell) as caught:
+        plan_in_world(CONFIGS / "dual_push_bench.yaml", world, settings=settings)
+    found = {(each.key, each.reason) for each in caught.value.problems}
+    assert ("arms.follower.host", "'leader' is there already") in found
+    assert ("sensors.follower_sensor.device", "'leader_sensor' is there already") in found
+
+
+@pytest.mark.parametrize(("first", "clash"), [(1, True), (7, False)])
+def test_arms_share_a_bus_if_no_two_of_their_motors_answer_to_one_number(first: int, clash: bool) -> None:
+    plan = plan_cell(CONFIGS / "steps_damiao_bench.yaml", to_run=False)
+    arm = plan.arms["arm"]
+    motors = [
+        motor.model_copy(update={"esc_id": first + k, "mst_id": first + k + 32})
+        for k, motor in enumerate(arm.config.motors)
+    ]
+    other = replace(arm, name="other", config=arm.config.model_copy(update={"motors": tuple(motors)}))
+    assert bool(list(clashes({"arm": arm, "other": other}))) == clash
+    assert len(set(addresses(replace(plan, arms={"arm": arm, "other": other})).values())) == 2

@@ -43,9 +43,12 @@ REQUIRED_OF_SENSORS: Final = ("depth", "frame_age")
 """Kinds that must guard every sensor of such a task."""
 REQUIRED_OF_NETWORKS: Final = ("out_of_range",)
 """Kinds that must guard every sensor of such a task whose estimator is a network."""
+ADVISED_OF_NETWORKS: Final = {"frame_frozen": "freeze", "exposure": "turn dark or bright"}
+"""Kinds of interlocks that tell, of a network's images, what their age does not."""
 REQUIRED_OF_READINGS: Final = frozenset({"reading_age"})
 """Kinds that a task which moves an arm must have if it uses the readings of another device."""
 
+_NETWORKS: Final = ("network", "edge_network")
 _COLUMNS = ("interlock", "kind", "subject", "limit", "trips at", "after", "stops within", "margin left")
 _ABILITIES: Final = {"true_contact": False, "known_surface": True}
 """Estimators of this package that are no networks, and whether their images can be checked."""
@@ -201,6 +204,18 @@ def require_armed(plan: CellPlan, interlocks: Sequence[Interlock | TimedInterloc
         raise ConfigError(problem.reason, file=str(plan.file), key=".".join(problem.path), hint=problem.hint)
 
 
+def advised(plan: CellPlan) -> Iterator[str]:
+    """Return what the cell may run without and should not, one sentence each."""
+    if not any(TwistSink in protocols for protocols in plan.task.arms.values()):
+        return
+    present = {entry.kind for entry in plan.cell.interlocks.values()}
+    missing = [kind for kind in ADVISED_OF_NETWORKS if kind not in present]
+    felt = [name for name in plan.sensor_roles.values() if plan.cell.sensors[name].estimator.kind in _NETWORKS]
+    if missing and felt:
+        names, what = ", ".join(felt), " or ".join(ADVISED_OF_NETWORKS[kind] for kind in missing)
+        yield f"advice   {names}: nothing trips when its images {what}: add {' and '.join(missing)}"
+
+
 def _required(plan: CellPlan, facts: CellFacts) -> Iterator[tuple[str, str, str]]:
     """Return (kind, role, "arm" or "sensor") of what must be guarded."""
     moved = [role for role, arm in facts.arms.items() if arm.moved]
@@ -214,7 +229,7 @@ def _required(plan: CellPlan, facts: CellFacts) -> Iterator[tuple[str, str, str]
             yield kind, role, "sensor"
         if sensor.arm in moved:
             yield "workspace", role, "sensor"
-        if plan.cell.sensors[plan.sensor_roles[role]].estimator.kind in ("network", "edge_network"):
+        if plan.cell.sensors[plan.sensor_roles[role]].estimator.kind in _NETWORKS:
             for kind in REQUIRED_OF_NETWORKS:
                 yield kind, role, "sensor"
 

@@ -71,19 +71,23 @@ def start_of(plan: CellPlan, arm: str, given: Sequence[float] | None) -> Start:
     from touchcell.drivers.kinematics.inverse import joints_for_pose
 
     reached: list[tuple[float, Start]] = []
+    missed = ""
     for T_base_tcp in wanted:
         try:
             q = joints_for_pose(chain, T_base_tcp, home)
-        except ConfigError:
+        except ConfigError as error:
+            missed = missed or error.reason
             continue
         reached.append((float(np.abs(q - home).max()), Start(_six(T_base_tcp), q)))
     if not reached:
+        pose = [round(value, 1) for value in _six(wanted[0])]
+        tool = "flange_to_tcp_mm_deg" if "flange_to_tcp_mm_deg" in type(device.config).model_fields else "tool"
         raise ConfigError(
-            "no joint angles reach the start pose",
+            f"no joint angles reach the start pose {pose}: {missed}",
             file=str(plan.file),
             key=f"arms.{arm}.start_pose_mm_deg",
-            value=[round(value, 1) for value in _six(wanted[0])],
-            hint=f"set arms.{arm}.start_pose_mm_deg, or correct its workspace and flange_to_tcp_mm_deg",
+            value=pose,
+            hint="correct it" if given is not None else f"set it, or correct the arm's workspace and {tool}",
         )
     return min(reached, key=lambda each: each[0])[1]
 

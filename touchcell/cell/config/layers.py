@@ -97,9 +97,8 @@ def _load(path: Path, above: Sequence[Path]) -> YamlFile:
     if len(above) >= _MOST_LAYERS:
         raise file.problem((EXTENDS,), f"leads through more than {_MOST_LAYERS} files", value=base_name)
     if not os.path.isfile(base_path):  # Path.is_file raises for a name that is too long
-        raise file.problem(
-            (EXTENDS,), "no such file", value=base_name, hint="the path is relative to the file that names it"
-        )
+        hint = "the path is relative to the file that names it"
+        raise file.problem((EXTENDS,), f"no such file: {base_name}", value=base_name, hint=hint)
     base = _load(base_path, [*above, resolved])
     lines, sources = dict(base.lines), {known: base.source(known) for known in base.lines}
     result = _merge(base.data, data, (), own, path, lines, sources)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Collection, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
@@ -17,6 +18,7 @@ from typing import Any, Final, TypeVar
 import numpy as np
 from pydantic import BaseModel
 
+from touchcell.cell.config.addresses import clashes
 from touchcell.cell.config.cell_plan import (
     REDUCED_SPEED_M_S,
     ArmSection,
@@ -157,7 +159,8 @@ class _Planner:
         arm_roles = self._roles(cell, "arms", task.arms, cell.arms) if task else {}
         sensor_roles = self._roles(cell, "sensors", task.sensors, cell.sensors) if task else {}
         auxiliary_roles = self._roles(cell, "devices", task.devices, cell.devices) if task else {}
-        others = {name: plan for name in cell.devices if (plan := self._auxiliary(cell, name))}
+        left_out = self._left_out(cell, set(auxiliary_roles.values()))
+        others = {name: plan for name in cell.devices if name not in left_out and (plan := self._auxiliary(cell, name))}
         auxiliaries = {
             name: plan
             for name, plan in others.items()
@@ -173,6 +176,7 @@ class _Planner:
         sensors = {name: plan for name, plan in devices.items() if name in needed_sensors}
         devices |= others
         self._require_names(cell)
+        self._require_addresses({**arms, **sensors, **auxiliaries})
         if task:
             self._require_collection(cell, task)
             self._require_protocols(task, "arms", task.arms, arm_roles, arms)
@@ -211,7 +215,8 @@ class _Planner:
             return planned
         if problems := unfeasible(file, planned):
             raise InvalidCell(problems)
-        return replace(self._require_armed(planned) if self._prove else planned, notes=_remarks(planned))
+        notes = (*_remarks(planned), *(f"{name}: left out, as {reason}" for name, reason in left_out.items()))
+        return replace(self._require_armed(planned) if self._prove else planned, notes=notes)
 
     def _in_truth(self, cell: CellFile) -> CellFile:
         """Return the cell with its scene as it truly is, and keep what is true of its devices."""
@@ -326,6 +331,27 @@ class _Planner:
         shared = {"mounted_on": section.mounted_on, "deactivate": section.deactivate}
         return self._device(cell, ("devices", name), section, shared, None)
 
+    def _left_out(self, cell: CellFile, needed: set[str]) -> dict[str, str]:
+        """Return the devices that a simulated world does without, by name with the reason: no task needs them."""
+        found: dict[str, str] = {}
+        if cell.world != "sim":
+            return found
+        for name in cell.devices.keys() - needed:
+            with suppress(ConfigError):
+                able = DRIVERS.load(cell.devices[name].driver).capabilities
+                if not able.virtual_time and able.kind not in STAND_INS.names():
+                    found[name] = f"nothing simulates {_a(able.kind)}"
+        return dict(sorted(found.items()))
+
+    def _require_addresses(self, devices: Mapping[str, DevicePlan]) -> None:
+        """No two devices are at one address."""
+        sections = {"arm": "arms", "camera": "sensors"}
+        for name, key, other in clashes(devices):
+            device = devices[name]
+            at = (sections.get(device.spec.capabilities.kind, "devices"), name, key)
+            value = getattr(device.config, key)
+            self._add(at, f"{other!r} is there already", value=value, hint="give each device its own address")
+
     def _require_mount(self, cell: CellFile, at: tuple[str, str], arm: str | None) -> None:
         if arm is not None and arm not in cell.arms:
             self._add((*at, "mounted_on"), f"there is no arm {arm!r}", value=arm, hint=suggest(arm, sorted(cell.arms)))
@@ -364,7 +390,7 @@ class _Planner:
                 hint="`touchcell list` tells which drivers there are",
             )
         spec = self._in_world(cell, at, section, spec)
-        if cell.time == "simulated" and not spec.capabilities.virtual_time:
+        if cell.time == "simulated" and cell.world != "sim" and not spec.capabilities.virtual_time:
             self._add(
                 (*at, "driver"), f"{spec.name} cannot run in simulated time", value=spec.name, hint="set `time: real`"
             )
@@ -621,6 +647,12 @@ class _Planner:
 
 
 def _remarks(plan: CellPlan) -> tuple[str, ...]:
+    from touchcell.cell.config.armed import advised
+
+    return (*advised(plan), *_remarks_on_scene(plan))
+
+
+def _remarks_on_scene(plan: CellPlan) -> tuple[str, ...]:
     scene = plan.cell.scene
     if scene is None:
         return ()

@@ -12,9 +12,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Literal, TypeAlias, get_args
 
-from touchcell.cell.config.cell_plan import CellPlan
+from pydantic import BaseModel, ConfigDict
+
+from touchcell.cell.config.cell_plan import CellPlan, Six
 from touchcell.cell.config.default_scene import Start, default_scene, start_of
-from touchcell.cell.config.yaml_file import load
+from touchcell.cell.config.input_files import with_input_files, with_paths
+from touchcell.cell.config.layers import load_layers
+from touchcell.cell.config.yaml_file import InvalidCell, YamlFile, load
+from touchcell.drivers.core.scene import scene_section
+from touchcell.errors import ConfigError, suggest
 from touchcell.input_file import BUILTIN
 
 WorldName: TypeAlias = Literal["sim", "emulated", "bench"]
@@ -109,16 +115,23 @@ def _add_scene(plan: CellPlan, world: WorldName, found: WorldChanges) -> None:
     key = "scene" if world == "sim" else "emulated_scene"
     cell = plan.cell
     starts: Mapping[str, Any] = {}
-    given = getattr(cell, key) or cell.scene or cell.emulated_scene
+    given = getattr(cell, key)
+    for other in ("scene", "emulated_scene"):
+        if given is None and (section := getattr(cell, other)) is not None:
+            given = _with_files(load_layers(plan.file, plan.settings), section, (other,))
     beside = scene_beside(plan.file)
     if given is None and os.path.isfile(beside):
-        written = load(beside).data
-        starts = written.pop("start_pose_mm_deg", {})
-        given = written
+        given, starts = _read_scene(beside, plan)
         found.notes.append(f"scene: {beside.name}")
-    found.starts = {
-        name: start_of(plan, name, cell.arms[name].start_pose_mm_deg or starts.get(name)) for name in plan.arms
-    }
+    for name in plan.arms:
+        own = cell.arms[name].start_pose_mm_deg
+        try:
+            found.starts[name] = start_of(plan, name, own or starts.get(name))
+        except ConfigError as error:
+            if own is not None or name not in starts:
+                raise
+            at, hint = f"start_pose_mm_deg.{name}", error.hint
+            raise ConfigError(error.reason, file=str(beside), key=at, value=error.value, hint=hint) from None
     for name, start in found.starts.items():
         found.settings[f"arms.{name}.start_pose_mm_deg"] = [round(value, 4) for value in start.pose_mm_deg]
     if given is None:
@@ -126,6 +139,35 @@ def _add_scene(plan: CellPlan, world: WorldName, found: WorldChanges) -> None:
         found.notes.append(f"scene: a default for {plan.task.name}; `check --explain` prints it")
     if getattr(cell, key) is None:
         found.settings[key] = dict(given)
+
+
+class _SceneFile(BaseModel):
+    """A scene beside a cell file: a `scene:` section, and where the arms start, by their names."""
+
+    model_config = ConfigDict(extra="allow")
+
+    start_pose_mm_deg: dict[str, Six] = {}
+
+
+def _read_scene(path: Path, plan: CellPlan) -> tuple[dict[str, Any] | None, Mapping[str, Six]]:
+    """Return the scene of a file, None if it has start poses only, and those. Raises ConfigError with the line."""
+    file = load(path)
+    starts = file.validate(_SceneFile, file.data).start_pose_mm_deg
+    for name in starts:
+        if name not in plan.cell.arms:
+            hint = suggest(name, sorted(plan.cell.arms))
+            raise file.problem(("start_pose_mm_deg", name), f"the cell has no arm {name!r}", value=name, hint=hint)
+    scene = {key: value for key, value in file.data.items() if key != "start_pose_mm_deg"}
+    return _with_files(file, scene, ()) if scene else None, starts
+
+
+def _with_files(file: YamlFile, scene: Mapping[str, Any], at: tuple[str, ...]) -> dict[str, Any]:
+    """Return a scene with the files that it names found: what a world puts in their place is read from elsewhere."""
+    section = file.validate(scene_section(), scene, at)
+    found, problems = with_input_files(file, section, at)
+    if problems:
+        raise InvalidCell(problems)
+    return with_paths(scene, section, found)
 
 
 def scene_beside(file: Path) -> Path:

@@ -15,13 +15,11 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Final, TextIO
+from typing import TextIO
 
+from touchcell.cell.config.addresses import address_of
 from touchcell.cell.config.cell_plan import CellPlan
 from touchcell.errors import TouchcellError
-
-_ADDRESSES: Final = ("host", "port", "channel", "device")
-"""Keys of drivers that say where a device is."""
 
 
 class BenchTaken(TouchcellError):
@@ -42,12 +40,7 @@ class BenchTaken(TouchcellError):
 
 def addresses(plan: CellPlan) -> Mapping[str, str]:
     """Return the address of each device that the plan builds, by name; a device without one has none."""
-    found = {}
-    for name, device in plan.built.items():
-        parts = [str(value) for key in _ADDRESSES if (value := getattr(device.config, key, None)) is not None]
-        if parts:
-            found[name] = f"{device.spec.name}:{','.join(parts)}"
-    return found
+    return {name: address for name, device in plan.built.items() if (address := address_of(device))}
 
 
 @contextmanager
@@ -66,7 +59,9 @@ def bench_lock(plan: CellPlan, folder: Path | None = None) -> Iterator[None]:
         folder.mkdir(parents=True, exist_ok=True)
         folder.chmod(0o1777)  # the mode of mkdir is subject to the umask
     with ExitStack() as held:
-        for name, address in sorted(addresses(plan).items()):
+        # Arms may share a bus.
+        holders = {address: name for name, address in sorted(addresses(plan).items(), reverse=True)}
+        for address, name in sorted(holders.items(), key=lambda each: each[1]):
             digest = hashlib.sha256(address.encode()).hexdigest()[:16]
             held.enter_context(_locked(folder / f"{digest}.lock", name, address))
         yield

@@ -146,7 +146,7 @@ class Fault:
         subject: role of the arm or sensor concerned.
         what: description, for the operator.
         limit: the limit that it exceeds, with its unit.
-        change: puts it into a snapshot.
+        change: puts it into a snapshot; whatever the state of the task, where no states are named.
         before: what the snapshots before it show, in place of a healthy cell.
         before_s: how long they last.
         within_s: time within which the interlock must have tripped.

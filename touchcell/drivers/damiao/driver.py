@@ -266,7 +266,8 @@ class DamiaoCanArm(BusArm):
             yield Finding(what, "check wiring, termination and bit rates", ("CANopenNode 319", "yarp-devices 246"))
         if self._bus.counters.not_sent:
             what = f"the adapter refused {self._bus.counters.not_sent} frames: {self._bus.last_error}"
-            yield Finding(what, "sudo ip link set can0 txqueuelen 1000", ("python-can 1495", "python-can 2004"), False)
+            remedy = f"sudo ip link set {self._config.channel} txqueuelen 1000"
+            yield Finding(what, remedy, ("python-can 1495", "python-can 2004"), False)
         queue = _transmit_queue(self._config)
         if queue is not None and queue < _SHORTEST_QUEUE:
             what = f"the transmit queue of {self._config.channel} holds {queue} frames"
@@ -618,7 +619,7 @@ def open_bus(device: str, config: DamiaoCanConfig) -> Any:
         raise ConnectError(
             device,
             f"cannot open CAN {config.interface} {config.channel}: {error}",
-            hint="is the interface up? `ip link set can0 up type can bitrate 1000000`"
+            hint=f"is the interface up? `ip link set {config.channel} up type can bitrate {config.bitrate}`"
             if is_kernels
             else f"is the adapter plugged in, and does it support {config.bitrate} bit/s?",
         ) from None

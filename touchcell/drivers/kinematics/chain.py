@@ -29,7 +29,7 @@ from touchcell.drivers.kinematics.joint_limits import (
 from touchcell.errors import ConfigError
 from touchcell.geometry.errors import GeometryError
 from touchcell.geometry.types import Array
-from touchcell.input_file import InputFile, files_in
+from touchcell.input_file import InputFile, files_in, read_yaml
 
 _CHAINS = Path(__file__).parent / "chains"
 ChainFile = Annotated[
@@ -126,7 +126,7 @@ class ChainDescription(_Description):
     def read(cls, path: Path) -> ChainDescription:
         """Read a YAML file. Raises ConfigError with the file and the invalid entry."""
         try:
-            return cls.model_validate(yaml.safe_load(path.read_text()))
+            return cls.model_validate(read_yaml(path))
         except (OSError, yaml.YAMLError, ValidationError) as error:
             raise ConfigError(f"is not a valid chain description: {error}", file=str(path)) from None
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from touchcell.geometry.types import Array
 from touchcell.perception.markers.detection import Discs, lattice, ring_numbers
@@ -35,14 +36,19 @@ def fit_lattice(discs: Discs, rings: int) -> tuple[Array, float]:
     best: tuple[float, Array, float] = (-np.inf, flat, np.inf)
     for turn in np.arange(12) * np.pi / 36:
         placed = complex(*centre) + reach * np.exp(1j * turn) * z
-        for step in range(16):
-            points = np.column_stack([placed.real, placed.imag])
-            partner, paired = pair(points, centres, (0.8 if step < 6 else 0.4) * reach / rings)
-            used = 2 if step < 6 else 4
-            if paired.sum() < 2 * used:
-                break
-            solution = np.linalg.lstsq(terms[paired, :used], seen_at[partner[paired]], rcond=None)[0]
-            placed = terms[:, :used] @ solution
+        for used, within, steps in ((2, 0.8, 6), (4, 0.4, 10)):
+            before: tuple[NDArray[np.bool_], NDArray[np.intp]] | None = None
+            for _ in range(steps):
+                points = np.column_stack([placed.real, placed.imag])
+                partner, paired = pair(points, centres, within * reach / rings)
+                seen = partner[paired]
+                # The same pairs again have the same solution.
+                same = before is not None and np.array_equal(paired, before[0]) and np.array_equal(seen, before[1])
+                if same or paired.sum() < 2 * used:
+                    break
+                before = paired, seen
+                solution = np.linalg.lstsq(terms[paired, :used], seen_at[seen], rcond=None)[0]
+                placed = terms[:, :used] @ solution
         points = np.column_stack([placed.real, placed.imag])
         partner, paired = pair(points, centres, 0.4 * reach / rings)
         if paired.any():

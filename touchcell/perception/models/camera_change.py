@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from touchcell.errors import ConfigError
 from touchcell.geometry.types import Array, ImageArray
+from touchcell.input_file import read_yaml
 
 Number = Annotated[float, Field(allow_inf_nan=False)]
 
@@ -95,7 +96,7 @@ def load_change(path: Path) -> CameraChange:
         ConfigError: the file is missing or invalid.
     """
     try:
-        return CameraChange.model_validate(yaml.safe_load(path.read_text(encoding="utf-8")))
+        return CameraChange.model_validate(read_yaml(path))
     except OSError as error:
         hint = "make one with `touchcell calibrate`"
         raise ConfigError(f"cannot be read: {error.strerror}", file=str(path), hint=hint) from None
