@@ -130,7 +130,7 @@ def _add_calibration(commands: Subparsers) -> None:
     calibrate.add_argument("--model", type=Path, required=True, metavar="FILE", help="model file")
     _add_out(calibrate, "calibration file to write (.yaml)")
     source = calibrate.add_mutually_exclusive_group(required=True)
-    source.add_argument("--frames", type=Path, metavar="DIR", help="folder with PNG images of the tip out of contact")
+    source.add_argument("--frames", type=Path, metavar="DIR", help="folder with images of the tip out of contact")
     source.add_argument("--cell", type=Path, metavar="CELL", help="cell file whose sensor takes them now")
     calibrate.add_argument("--sensor", metavar="NAME", help="which sensor of the cell (default: its only one)")
     calibrate.add_argument(
