@@ -136,3 +136,12 @@ def test_natural_order_takes_images_and_labels_along(tmp_path: Path) -> None:
     split = read_split(_table(tmp_path, f"{HEADER}\n{rows}", ("i_2.png", "i_10.png")), "val").in_order()
     assert [path.name for path in split.images] == ["i_2.png", "i_10.png"]
     np.testing.assert_array_equal(split.contact_mm_deg[:, 2], [1, 3])
+
+
+def test_image_of_another_kind_is_told_from_a_missing_one(tmp_path: Path) -> None:
+    data = _table(tmp_path, f"{HEADER}\na.tif,1,2,3,4,5,6\n", ("a.tif",))
+    with pytest.raises(DataError, match=r"'a\.tif' is none of \.png"):
+        read_split(data, "val")
+    (data / "val" / "images" / "a.tif").unlink()
+    with pytest.raises(DataError, match=r"'a\.tif' is not in"):
+        read_split(data, "val")

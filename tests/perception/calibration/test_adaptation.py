@@ -186,11 +186,79 @@ def test_sigma_covers_most_left_out_contacts_of_the_other_sensor(
     assert min(coverage.values()) > 0.75
 
 
-def test_labels_of_other_images_are_refused(model: Model, other_sensor: tuple[LabelledDiscs, LabelledDiscs]) -> None:
+def _wrong(contacts: np.ndarray, what: str) -> np.ndarray:
+    """Return labels (n, 6) as somebody might have got them wrong."""
+    other = np.random.default_rng(1).permutation(len(contacts))
+    wrong = contacts.copy()
+    if what == "other images":
+        wrong = contacts[other]
+    elif what == "shear of other images":
+        wrong[:, :2] = contacts[other, :2]
+    elif what == "depth of other images":
+        wrong[:, 2] = contacts[other, 2]
+    elif what == "radians":
+        wrong[:, 3:] = np.radians(contacts[:, 3:])
+    elif what == "metres":
+        wrong[:, :3] *= 1e-3
+    elif what == "tilt and torsion swapped":
+        wrong[:, [3, 5]] = contacts[:, [5, 3]]
+    elif what == "x and depth swapped":
+        wrong[:, [0, 2]] = contacts[:, [2, 0]]
+    elif what == "depth of the other sign":
+        wrong[:, 2] *= -1.0
+    return wrong
+
+
+@pytest.mark.parametrize(
+    ("what", "says"),
+    [
+        ("other images", "depth and tilt and shear cannot be what the images show"),
+        ("shear of other images", "labels' shear cannot be"),
+        ("depth of other images", "labels' depth cannot be"),
+        ("radians", "tilt in degrees"),
+        ("metres", "depth in mm"),
+        ("tilt and torsion swapped", "labels' tilt"),
+        ("x and depth swapped", "labels' depth"),
+        ("depth of the other sign", "grows into the surface"),
+    ],
+)
+def test_labels_that_cannot_be_of_these_images_are_refused_whatever_is_wrong_with_them(
+    model: Model, other_sensor: tuple[LabelledDiscs, LabelledDiscs], what: str, says: str
+) -> None:
+    few, _ = other_sensor
+    wrong = dataclasses.replace(few, xi=xi_from_contact(_wrong(contact_from_xi(few.xi), what)))
+    with pytest.raises(TrainingError) as caught:
+        _adapted(model, wrong)
+    assert says in str(caught.value)
+
+
+def test_candidates_that_are_hardly_better_than_the_mean_are_refused(
+    model: Model, other_sensor: tuple[LabelledDiscs, LabelledDiscs], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("touchcell.perception.calibration.adaptation.refuse_unlike", lambda *_: None)
     few, _ = other_sensor
     shuffled = dataclasses.replace(few, xi=few.xi[np.random.default_rng(1).permutation(len(few.xi))])
     with pytest.raises(TrainingError, match="better on left-out contacts"):
         _adapted(model, shuffled)
+
+
+def test_image_with_the_label_of_another_is_named(
+    model: Model, other_sensor: tuple[LabelledDiscs, LabelledDiscs]
+) -> None:
+    few, _ = other_sensor
+    assert not {"3", "26"} & set(_adapted(model, few).doubtful)
+    xi = few.xi.copy()
+    xi[[3, 26]] = few.xi[[26, 3]]
+    found = adapt_to(
+        model,
+        dataclasses.replace(few, xi=xi),
+        preprocessing=model.header.preprocessing,
+        size=SIZE_OF_MARKERS,
+        settings=SETTINGS,
+        names=[f"image_{i}.png" for i in range(len(xi))],
+    )
+    assert set(found.doubtful) >= {"image_3.png", "image_26.png"}
+    assert len(found.doubtful) <= 6
 
 
 def test_depths_and_directions_without_contacts_are_named() -> None:

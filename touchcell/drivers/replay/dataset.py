@@ -44,6 +44,7 @@ _BOX = re.compile(r"bbox\W*?\[([^\]]*)\]")
 
 _PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
 _LEAST_OF_16_BITS = 4096
+_MOST_MM_DEG = 180.0
 
 
 @dataclass(frozen=True)
@@ -101,7 +102,7 @@ def read_split(root: Path, split: str) -> Split:
 
     Raises:
         DataError: the folder, the split, the label file, a column or an image is missing; the split is empty; a label
-            is not a finite number; two rows name one image.
+            is not a finite number or beyond 180 mm or degrees; two rows name one image; a row has more or fewer values.
     """
     folder = split_folder(root, split)
     if not folder.is_dir():
@@ -129,9 +130,9 @@ def read_split(root: Path, split: str) -> Split:
                 raise DataError(table, "more or fewer values than columns", row=rows.line_num)
             name = row[image_column].strip()
             if name not in present:
-                raise DataError(
-                    table, f"image {name!r} is not in {image_folder}", row=rows.line_num, column=image_column
-                )
+                known = f"is none of {', '.join(IMAGE_SUFFIXES)}"
+                reason = known if name and (image_folder / name).is_file() else f"is not in {image_folder}"
+                raise DataError(table, f"image {name!r} {reason}", row=rows.line_num, column=image_column)
             if name in seen:
                 raise DataError(table, f"image {name!r} has two rows", row=rows.line_num, column=image_column)
             seen.add(name)
@@ -287,6 +288,14 @@ def _number(text: str | None, table: Path, row: int, column: str) -> float:
         value = math.nan
     if not math.isfinite(value):
         raise DataError(table, f"{text!r} is not a finite number", row=row, column=column)
+    if abs(value) > _MOST_MM_DEG:
+        raise DataError(
+            table,
+            f"{value:g} is no contact of such a sensor",
+            row=row,
+            column=column,
+            hint="labels are in mm and degrees, about the surface that is touched",
+        )
     return value
 
 

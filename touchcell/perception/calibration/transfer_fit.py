@@ -101,13 +101,14 @@ class Convention:
     Attributes:
         mirrored: in a mirror.
         shear_axes_rad, tilt_axes_rad: angles from the networks' vectors to the labels'.
-        explained: fraction of the labels' shear and tilt that this convention explains, without any fit of magnitudes.
+        shear_explained, tilt_explained: correlation of the labels' shear and tilt with the outputs', as vectors.
     """
 
     mirrored: bool
     shear_axes_rad: float
     tilt_axes_rad: float
-    explained: float
+    shear_explained: float
+    tilt_explained: float
 
     @property
     def shear_reversed(self) -> bool:
@@ -119,15 +120,15 @@ def find_convention(outputs: Array, contacts: Array) -> Convention:
     """Return the convention, mirrored or not, in which outputs (n, 6) are most similar to labels (n, 6), mm, deg."""
     found = []
     for mirrored in (False, True):
-        angles, explained = [], 0.0
+        angles, explained = [], []
         for first in (SHEAR, TILT):
             a, b = plane(reflected(outputs) if mirrored else outputs, first), plane(contacts, first)
             a, b = a - a.mean(), b - b.mean()
             product = complex(np.vdot(a, b))
             angles.append(float(np.angle(product)))
-            explained += abs(product) / max(float(np.linalg.norm(a) * np.linalg.norm(b)), 1e-12) / 2
-        found.append(Convention(mirrored, angles[0], angles[1], explained))
-    return max(found, key=lambda each: each.explained)
+            explained.append(abs(product) / max(float(np.linalg.norm(a) * np.linalg.norm(b)), 1e-12))
+        found.append(Convention(mirrored, *angles, *explained))
+    return max(found, key=lambda each: each.shear_explained + each.tilt_explained)
 
 
 @dataclass(frozen=True)
