@@ -63,7 +63,7 @@ _SECTORS = 8
 _LEAST_SIMILAR_DEPTH, _LEAST_SIMILAR_TILT, _LEAST_SIMILAR_SHEAR = 0.6, 0.7, 0.25
 _LEAST_DEPTH_RATIO, _LEAST_TILT_RATIO = 0.05, 0.05
 _USEFUL = 0.8
-_DOUBTFUL = 12.0
+_DOUBTFUL, _FAR = 12.0, 5.0
 
 Method = Literal["transfer", "scratch"]
 
@@ -186,6 +186,8 @@ def adapt_to(
         raise TrainingError(f"{int(matched.sum())} images could be matched, {_FEWEST} are needed", hint="give more")
     contacts = contact_from_xi(dataset.xi[matched])
     candidates = _Candidates(old, displacements[matched], contacts, settings)
+    used = np.flatnonzero(matched)
+    refuse_outliers(contacts, [names[i] if names else f"image {i}" for i in used])
     convention = find_convention(candidates.outputs, contacts)
     refuse_unlike(candidates.outputs, contacts, convention)
     method, left_out = candidates.judged()
@@ -232,7 +234,7 @@ def adapt_to(
         tensors,
     )
     mean = left_out["mean"]
-    numbers = np.flatnonzero(matched)[candidates.doubtful(method)]
+    numbers = used[candidates.doubtful(method)]
     return Adapted(
         model=model,
         method=method,
@@ -246,6 +248,18 @@ def adapt_to(
         ),
         doubtful=tuple(names[i] if names else str(i) for i in numbers),
     )
+
+
+def refuse_outliers(contacts: Array, names: Sequence[str]) -> None:
+    """Raise TrainingError where a label of contacts (n, 6) is far from all others, with the image's name."""
+    low, middle, high = np.quantile(contacts, [0.1, 0.5, 0.9], axis=0)
+    off = np.abs(contacts - middle) / np.maximum(high - low, 1e-6)
+    i, component = np.unravel_index(int(np.argmax(off)), off.shape)
+    if off[i, component] > _FAR:
+        raise TrainingError(
+            f"{names[i]}: {CONTACT_NAMES[component]} of {contacts[i, component]:g} is far from all others",
+            hint="check the row of this image",
+        )
 
 
 def refuse_unlike(outputs: Array, contacts: Array, convention: Convention) -> None:
