@@ -35,7 +35,7 @@ from touchcell.perception.calibration.transfer_fit import (
 )
 from touchcell.perception.errors import ModelError, TrainingError
 from touchcell.perception.markers.camera_check import transferred_check
-from touchcell.perception.markers.detection import Discs, detect_markers, typical_size
+from touchcell.perception.markers.detection import Discs, detect_markers
 from touchcell.perception.markers.estimator import displacement_model_of, matcher_of
 from touchcell.perception.markers.lattice_fit import fit_lattice
 from touchcell.perception.markers.layers import layers_of, mixed
@@ -48,7 +48,7 @@ from touchcell.perception.models.model_file import Header, Labels, Model, load_m
 from touchcell.perception.models.preprocessing import Preprocessing
 from touchcell.perception.networks.contact_network import Alignment
 from touchcell.perception.networks.displacement_network import DisplacementNetwork, Jitter, displacement_loss
-from touchcell.perception.networks.marker_training import LabelledDiscs, preprocessing_for
+from touchcell.perception.networks.marker_training import LabelledDiscs, preprocessing_and_size
 from touchcell.perception.networks.sigma_scaling import calibrate
 
 _SHALLOW, _LOOKED_AT = 10, 200
@@ -155,8 +155,7 @@ def adapt(
     chosen = by_depth[evenly(len(by_depth), len(by_depth) if frames is None else frames)]
     split = replace(split, images=tuple(split.images[i] for i in chosen), contact_mm_deg=split.contact_mm_deg[chosen])
     images = list(split.read())
-    preprocessing = preprocessing_for(images[0])
-    size = typical_size(preprocessing.reduce(images[0]))
+    preprocessing, size = preprocessing_and_size(images)
     dataset = LabelledDiscs(
         [detect_markers(preprocessing.reduce(image), size) for image in images],
         xi_from_contact(split.contact_mm_deg),
