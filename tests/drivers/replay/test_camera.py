@@ -17,6 +17,7 @@ from touchcell.drivers.core.errors import (
 from touchcell.drivers.core.protocols import FrameSource, HealthSource
 from touchcell.drivers.core.spec import DRIVERS, DriverContext
 from touchcell.drivers.replay.camera import ReplayCamera, ReplayCameraConfig
+from touchcell.drivers.replay.dataset import IMAGE_COLUMN, IMAGE_FOLDER, LABEL_COLUMNS
 
 
 def write(folder: Path, name: str, level: int, shape: tuple[int, ...] = (12, 16)) -> Path:
@@ -135,3 +136,44 @@ def test_a_deleted_image_raises_device_gone(folder: Path) -> None:
         (folder / "image_1.png").unlink()
         with pytest.raises(DeviceGone):
             camera.latest()
+
+
+def as_split(folder: Path, split: Path, names: list[str]) -> Path:
+    """Move images into a split whose labels have these images, and return its data set."""
+    split.mkdir(parents=True)
+    folder.rename(split / IMAGE_FOLDER)
+    rows = [",".join([IMAGE_COLUMN, *LABEL_COLUMNS]), *(f"{name},1,2,3,4,5,6" for name in names)]
+    (split / "targets_images.csv").write_text("\n".join(rows) + "\n")
+    return split.parent
+
+
+def test_of_a_labelled_split_only_images_with_a_label_are_played_as_the_arm_has_no_pose_for_others(
+    folder: Path, tmp_path: Path
+) -> None:
+    root = as_split(folder, tmp_path / "set" / "val_data", ["image_12.png", "image_2.png", "image_3.png"])
+    config = ReplayCameraConfig(data=root, split="val", rate_hz=10.0)
+    with ReplayCamera("camera", config, VirtualClock()) as camera:
+        assert [camera.next(seq - 1, 1.0).value.image[0, 0] for seq in range(3)] == [2, 3, 12]
+        with pytest.raises(EndOfStream):
+            camera.next(2, 1.0)
+
+
+def test_damaged_labels_of_a_split_do_not_connect(folder: Path) -> None:
+    root = as_split(folder, folder.parent / "set" / "val", ["image_99.png"])
+    camera = ReplayCamera("camera", ReplayCameraConfig(data=root, split="val", rate_hz=10.0), VirtualClock())
+    with pytest.raises(ConnectError, match=r"image_99\.png"):
+        camera.connect()
+
+
+def test_a_labelled_split_is_played_in_grey_as_it_was_trained_on(folder: Path) -> None:
+    write(folder, "image_1.png", 77, (12, 16, 3))
+    root = as_split(folder, folder.parent / "set" / "val", ["image_1.png"])
+    config = ReplayCameraConfig(data=root, split="val", rate_hz=10.0)
+    with ReplayCamera("camera", config, VirtualClock()) as camera:
+        assert camera.latest().value.image.shape == (12, 16)
+
+
+def test_unscaled_values_of_a_twelve_bit_camera_are_refused(tmp_path: Path) -> None:
+    assert cv2.imwrite(str(tmp_path / "image_1.png"), np.full((12, 16), 4000, np.uint16))
+    with play(tmp_path, VirtualClock()) as camera, pytest.raises(CorruptMessage, match="16 bits"):
+        camera.latest()

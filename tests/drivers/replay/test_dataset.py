@@ -73,3 +73,75 @@ def test_file_that_is_no_video_is_refused(tmp_path: Path) -> None:
     (tmp_path / "empty.mp4").write_bytes(b"")
     with pytest.raises(DataError, match="not a video"):
         read_image(tmp_path / "empty.mp4")
+
+
+def _table(folder: Path, text: str, names: tuple[str, ...] = ("a.png", "b.png")) -> Path:
+    (folder / "val" / "images").mkdir(parents=True)
+    for name in names:
+        cv2.imwrite(str(folder / "val" / "images" / name), np.zeros((4, 4), np.uint8))
+    (folder / "val" / "targets.csv").write_text(text)
+    return folder
+
+
+OTHERS = "pose_1,pose_2,pose_3,pose_4,pose_5,pose_6,shear_1,shear_2,shear_3,shear_4,shear_5,shear_6"
+HEADER = ",".join([IMAGE_COLUMN, *LABEL_COLUMNS])
+
+
+def test_numbered_labels_in_a_folder_of_another_name_are_read(tmp_path: Path) -> None:
+    text = f"sensor_video,{OTHERS}\na.png,0,0,3,4,5,0,1,2,0,0,0,6\n"
+    split = read_split(_table(tmp_path, text), "val")
+    np.testing.assert_array_equal(split.contact_mm_deg, [[1, 2, 3, 4, 5, 6]])
+    assert split.unlabelled == 1
+
+
+def test_spaces_around_names_and_blank_lines_are_ignored(tmp_path: Path) -> None:
+    text = HEADER.replace(",", " , ") + "\n\na.png ,1,2,3,4,5,6\n,,,,,,\n b.png,1,2,3,4,5,7\n"
+    split = read_split(_table(tmp_path, text), "val")
+    assert [path.name for path in split.images] == ["a.png", "b.png"]
+    np.testing.assert_array_equal(split.contact_mm_deg[:, 5], [6, 7])
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        (f"{HEADER}\na.png,1,2,3,4,5\n", "line 2: more or fewer values than columns"),
+        (f"{HEADER}\na.png,1,2,3,4,5,6,7\n", "line 2: more or fewer values than columns"),
+        (f"{HEADER}\na.png,1,2,nan,4,5,6\n", "column pose_z: 'nan' is not a finite number"),
+        (f"{HEADER}\na.png,1,2,,4,5,6\n", "column pose_z: '' is not a finite number"),
+        (f"{HEADER},pose_z\na.png,1,2,3,4,5,6,7\n", "column pose_z: two columns of this name"),
+        (HEADER.replace("pose_z", "depth") + "\na.png,1,2,3,4,5,6\n", "columns there: sensor_image, shear_x"),
+        (HEADER.replace(",", ";") + "\na.png;1;2;3;4;5;6\n", "missing column"),
+    ],
+)
+def test_damaged_rows_are_named(tmp_path: Path, text: str, says: str) -> None:
+    with pytest.raises(DataError) as caught:
+        read_split(_table(tmp_path, text), "val")
+    assert says in str(caught.value)
+
+
+def test_crop_is_read_from_a_file_that_is_not_quite_json_and_such_a_file_without_it_is_ignored(tmp_path: Path) -> None:
+    data = _table(tmp_path, f"{HEADER}\na.png,1,2,3,4,5,6\n")
+    params = tmp_path / "processed_image_params.json"
+    params.write_text('{"source": 0, bbox": [115, 10, 535, 430], "thresh": [61, 5]]}')
+    assert read_split(data, "val").crop == (115, 10, 535, 430)
+    params.write_text('{"source": 0, "thresh": [61, 5]]}')
+    assert read_split(data, "val").crop is None
+    params.write_text('{"bbox": [115, 10, 535], "thresh": [61, 5]]}')
+    with pytest.raises(DataError, match="bbox"):
+        read_split(data, "val")
+
+
+def test_natural_order_takes_images_and_labels_along(tmp_path: Path) -> None:
+    rows = "".join(f"{name},0,0,{depth},0,0,0\n" for name, depth in (("i_10.png", 3), ("i_2.png", 1)))
+    split = read_split(_table(tmp_path, f"{HEADER}\n{rows}", ("i_2.png", "i_10.png")), "val").in_order()
+    assert [path.name for path in split.images] == ["i_2.png", "i_10.png"]
+    np.testing.assert_array_equal(split.contact_mm_deg[:, 2], [1, 3])
+
+
+def test_image_of_another_kind_is_told_from_a_missing_one(tmp_path: Path) -> None:
+    data = _table(tmp_path, f"{HEADER}\na.tif,1,2,3,4,5,6\n", ("a.tif",))
+    with pytest.raises(DataError, match=r"'a\.tif' is none of \.png"):
+        read_split(data, "val")
+    (data / "val" / "images" / "a.tif").unlink()
+    with pytest.raises(DataError, match=r"'a\.tif' is not in"):
+        read_split(data, "val")

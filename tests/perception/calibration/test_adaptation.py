@@ -32,7 +32,7 @@ from touchcell.perception.markers.detection import Discs
 from touchcell.perception.markers.estimator import MarkerEstimator, matcher_of
 from touchcell.perception.markers.layers import layers_of, outputs_of
 from touchcell.perception.markers.matching import DisplacementModel
-from touchcell.perception.markers.transfer import lattice_symmetries, symmetric_fields
+from touchcell.perception.markers.transfer import lattice_symmetries, ring_modes, ring_weights, symmetric_fields
 from touchcell.perception.models.labels import contact_from_xi, xi_from_contact
 from touchcell.perception.models.marker_architecture import MarkerArchitecture, MarkerSize
 from touchcell.perception.models.model_file import Header, Labels, Model, load_model, save_model
@@ -186,11 +186,89 @@ def test_sigma_covers_most_left_out_contacts_of_the_other_sensor(
     assert min(coverage.values()) > 0.75
 
 
-def test_labels_of_other_images_are_refused(model: Model, other_sensor: tuple[LabelledDiscs, LabelledDiscs]) -> None:
+def _wrong(contacts: np.ndarray, what: str) -> np.ndarray:
+    """Return labels (n, 6) as somebody might have got them wrong."""
+    other = np.random.default_rng(1).permutation(len(contacts))
+    wrong = contacts.copy()
+    if what == "other images":
+        wrong = contacts[other]
+    elif what == "shear of other images":
+        wrong[:, :2] = contacts[other, :2]
+    elif what == "depth of other images":
+        wrong[:, 2] = contacts[other, 2]
+    elif what == "radians":
+        wrong[:, 3:] = np.radians(contacts[:, 3:])
+    elif what == "metres":
+        wrong[:, :3] *= 1e-3
+    elif what == "tilt and torsion swapped":
+        wrong[:, [3, 5]] = contacts[:, [5, 3]]
+    elif what == "x and depth swapped":
+        wrong[:, [0, 2]] = contacts[:, [2, 0]]
+    elif what == "depth of the other sign":
+        wrong[:, 2] *= -1.0
+    return wrong
+
+
+@pytest.mark.parametrize(
+    ("what", "says"),
+    [
+        ("other images", "depth and tilt and shear cannot be what the images show"),
+        ("shear of other images", "labels' shear cannot be"),
+        ("depth of other images", "labels' depth cannot be"),
+        ("radians", "tilt in degrees"),
+        ("metres", "depth in mm"),
+        ("tilt and torsion swapped", "labels' tilt"),
+        ("x and depth swapped", "labels' depth"),
+        ("depth of the other sign", "grows into the surface"),
+    ],
+)
+def test_labels_that_cannot_be_of_these_images_are_refused_whatever_is_wrong_with_them(
+    model: Model, other_sensor: tuple[LabelledDiscs, LabelledDiscs], what: str, says: str
+) -> None:
+    few, _ = other_sensor
+    wrong = dataclasses.replace(few, xi=xi_from_contact(_wrong(contact_from_xi(few.xi), what)))
+    with pytest.raises(TrainingError) as caught:
+        _adapted(model, wrong)
+    assert says in str(caught.value)
+
+
+def test_single_label_far_from_all_others_is_named(
+    model: Model, other_sensor: tuple[LabelledDiscs, LabelledDiscs]
+) -> None:
+    few, _ = other_sensor
+    contacts = contact_from_xi(few.xi)
+    contacts[7, 2] = 60.0
+    with pytest.raises(TrainingError, match=r"^image 7: z_mm of 60 is far from all others"):
+        _adapted(model, dataclasses.replace(few, xi=xi_from_contact(contacts)))
+
+
+def test_candidates_that_are_hardly_better_than_the_mean_are_refused(
+    model: Model, other_sensor: tuple[LabelledDiscs, LabelledDiscs], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("touchcell.perception.calibration.adaptation.refuse_unlike", lambda *_: None)
     few, _ = other_sensor
     shuffled = dataclasses.replace(few, xi=few.xi[np.random.default_rng(1).permutation(len(few.xi))])
     with pytest.raises(TrainingError, match="better on left-out contacts"):
         _adapted(model, shuffled)
+
+
+def test_image_with_the_label_of_another_is_named(
+    model: Model, other_sensor: tuple[LabelledDiscs, LabelledDiscs]
+) -> None:
+    few, _ = other_sensor
+    assert not {"3", "26"} & set(_adapted(model, few).doubtful)
+    xi = few.xi.copy()
+    xi[[3, 26]] = few.xi[[26, 3]]
+    found = adapt_to(
+        model,
+        dataclasses.replace(few, xi=xi),
+        preprocessing=model.header.preprocessing,
+        size=SIZE_OF_MARKERS,
+        settings=SETTINGS,
+        names=[f"image_{i}.png" for i in range(len(xi))],
+    )
+    assert {"image_3.png", "image_26.png"} & set(found.doubtful)
+    assert len(found.doubtful) <= 6
 
 
 def test_depths_and_directions_without_contacts_are_named() -> None:
@@ -217,6 +295,21 @@ def test_symmetric_copies_are_the_lattice_turned_and_reflected() -> None:
     np.testing.assert_allclose(once, displacements, atol=1e-4)
     twice = symmetric_fields(copies[6].astype(float), reference, [symmetries[6]])[0]
     np.testing.assert_allclose(twice, displacements, atol=1e-4)
+
+
+def test_what_rings_do_turns_with_the_markers_or_stays_and_is_reflected_with_them() -> None:
+    tip = Tip(TIP)
+    reference = tip.project(tip.rest_positions)
+    displacements = np.random.default_rng(0).normal(0.0, 1.0, (3, 662))
+    symmetries = lattice_symmetries(10)
+    copies = symmetric_fields(displacements, reference, [symmetries[0], symmetries[1], symmetries[6]])
+    plain, turned_, mirrored = (ring_modes(each.astype(float), ring_weights(reference)) for each in copies)
+    assert plain.shape == (3, 5, 3)
+    np.testing.assert_allclose(turned_[:, :, [0, 2]], np.exp(1j * np.pi / 3) * plain[:, :, [0, 2]], atol=1e-5)
+    np.testing.assert_allclose(turned_[:, :, 1], plain[:, :, 1], atol=1e-5)
+    np.testing.assert_allclose(mirrored[:, :, 1], plain[:, :, 1].conj(), atol=1e-5)
+    axis = mirrored[:, :, [0, 2]] / plain[:, :, [0, 2]].conj()
+    np.testing.assert_allclose(axis, np.broadcast_to(axis[0, 0, 0], axis.shape), atol=1e-3)
 
 
 def test_turned_predictions_are_about_turned_axes() -> None:

@@ -11,10 +11,10 @@ import pytest
 from tests.helpers.tactile_samples import SIZE, contacts, draw, labelled, preprocessing, write_split
 from touchcell.drivers.replay.dataset import read_image, read_split
 from touchcell.errors import DataError
-from touchcell.perception.errors import ImageError
+from touchcell.perception.errors import ImageError, TrainingError
 from touchcell.perception.models.labels import contact_from_xi, xi_from_contact
 from touchcell.perception.networks import dataset
-from touchcell.perception.networks.dataset import LabelledImages, load_reduced
+from touchcell.perception.networks.dataset import LabelledImages, label_range, load_reduced
 
 
 @pytest.fixture
@@ -221,3 +221,12 @@ def test_digest_depends_on_the_content() -> None:
     other_label = LabelledImages(data.images, data.xi + 1e-6)
     assert data.digest() == same.digest()
     assert len({data.digest(), other_image.digest(), other_label.digest()}) == 3
+
+
+def test_labels_in_metres_or_radians_are_refused() -> None:
+    contacts = np.random.default_rng(0).uniform([-4, -4, 1, -20, -20, -4], [4, 4, 5, 20, 20, 4], (20, 6))
+    label_range(xi_from_contact(contacts), xi_from_contact(contacts))
+    for scale in ([1e-3] * 3 + [1.0] * 3, [1.0] * 3 + [np.pi / 180] * 3):
+        small = xi_from_contact(contacts * scale)
+        with pytest.raises(TrainingError, match="mm and degrees"):
+            label_range(small, small)

@@ -16,8 +16,8 @@ from touchcell.drivers.core.clock import VirtualClock
 from touchcell.errors import DataError
 from touchcell.perception.errors import ImageError, ModelError
 from touchcell.perception.models.labels import XI_UNITS, xi_from_contact
-from touchcell.perception.models.model_file import Labels, save_model
-from touchcell.perception.networks.evaluate import evaluate, print_table
+from touchcell.perception.models.model_file import Labels, load_model, save_model
+from touchcell.perception.networks.evaluate import evaluate, print_table, warnings_of
 
 N = 25
 HALF = np.array([5e-3, 5e-3, 3e-3, 0.4, 0.4, 0.1])
@@ -86,7 +86,16 @@ def test_json_has_the_documented_keys(data: Path, model: Path, tmp_path: Path) -
     evaluation = evaluate(data, "val", model)
     evaluation.write(tmp_path / "out" / "evaluation.json")
     fields = json.loads((tmp_path / "out" / "evaluation.json").read_text())
-    assert list(fields) == ["n", "mae", "nll", "latency_ms", "coverage"]
+    assert list(fields) == [
+        "n",
+        "mae",
+        "nll",
+        "latency_ms",
+        "mae_of_median",
+        "accepted",
+        "refusals",
+        "coverage",
+    ]
     assert list(fields["latency_ms"]) == ["median", "p99"]
     assert fields["n"] == N
     assert fields["mae"] == evaluation.mae
@@ -102,6 +111,29 @@ def test_table_shows_every_figure(data: Path, model: Path) -> None:
         assert f"{error:.3f}" in shown
     assert f"NLL {evaluation.nll:.3f}" in shown
     assert "1.00 ms" in shown
+
+
+def test_it_says_how_many_images_are_accepted_and_why_others_are_not_and_what_is_no_better_than_the_median(
+    data: Path, model: Path, tmp_path: Path
+) -> None:
+    evaluation = evaluate(data, "val", model)
+    assert evaluation.accepted == 1.0
+    assert evaluation.refusals == {}
+    labels = contacts(N, seed=6)
+    assert evaluation.mae_of_median["z_mm"] == pytest.approx(np.abs(labels - np.median(labels, axis=0)).mean(axis=0)[2])
+    # A model that always predicts the middle of its range can be no better than the median.
+    assert "z_mm, alpha_deg, beta_deg, x_mm, y_mm, gamma_deg: no better than the median" in warnings_of(evaluation)[0]
+
+    base = load_model(model)
+    tensors = {name: np.full_like(each, 9.0) if name.endswith("bias") else each for name, each in base.tensors.items()}
+    save_model(dataclasses.replace(base, tensors=tensors), tmp_path / "outside.safetensors")
+    refused = evaluate(data, "val", tmp_path / "outside.safetensors")
+    assert refused.accepted == 0.0
+    assert refused.refusals == {"beyond the contacts that were taught": N}
+    text = io.StringIO()
+    print_table(refused, Console(file=text, width=100))
+    assert "0.0 % of the images accepted" in text.getvalue()
+    assert f"warning: {N} images not accepted: beyond the contacts that were taught" in text.getvalue()
 
 
 def test_opencv_threads_are_restored(data: Path, model: Path) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 from touchcell.cell.config.schema import plan_cell
 from touchcell.cell.runtime.devices import build_devices
 from touchcell.drivers.core.protocols import FrameSource
-from touchcell.drivers.replay.dataset import natural_order, read_image
+from touchcell.drivers.replay.dataset import IMAGE_SUFFIXES, natural_order, read_image
 from touchcell.errors import ConfigError, DataError
 from touchcell.geometry.types import ImageArray
 from touchcell.perception.markers.zero_frame import find_change
@@ -60,10 +60,11 @@ def calibrate(
 
 
 def images_in(folder: Path) -> list[ImageArray]:
-    """All PNG images of a folder."""
-    paths = sorted(folder.glob("*.png"), key=natural_order)
+    """All images of a folder, and the last frames of its videos."""
+    found = folder.iterdir() if folder.is_dir() else ()
+    paths = sorted((path for path in found if path.suffix.lower() in IMAGE_SUFFIXES), key=natural_order)
     if not paths:
-        raise DataError(folder, "holds no PNG images", hint="record ten or more with the tip out of contact")
+        raise DataError(folder, "holds no PNG or JPEG images", hint="record ten or more with the tip out of contact")
     return [read_image(path) for path in paths]
 
 

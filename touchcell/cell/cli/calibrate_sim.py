@@ -18,7 +18,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from touchcell.drivers.replay.dataset import Split, read_image, read_split
+from touchcell.drivers.replay.dataset import Split, read_image, read_split, split_folder
 from touchcell.geometry.types import Array
 from touchcell.perception.calibration.marked_data import MarkedContacts, SensorMarkers, evenly, learn_sensor
 from touchcell.progress import shown_progress
@@ -83,15 +83,16 @@ def calibrate_sim(
     training = read_split(data, "train")
     with shown_progress() as show:
         markers = learn_sensor(data, images=images, rings=rings, guess_steps=guess_steps, seed=seed, progress=show)
-        chosen = evenly(len(training.images), frames)
-        rest = np.setdiff1d(np.arange(len(training.images)), chosen)
+        by_depth = np.argsort(training.contact_mm_deg[:, 2], kind="stable")
+        chosen = by_depth[evenly(len(by_depth), frames)]
+        rest = by_depth[~np.isin(by_depth, chosen)]
         others = rest[evenly(len(rest), _HELD_OUT)]
-        contacts, fitted_to = markers.contacts(training, np.array(chosen), show)
+        contacts, fitted_to = markers.contacts(training, chosen, show)
         sensor = fit_tip(contacts, markers.reference, rings, progress=partial(show, "fitted"))
         sensor = replace(sensor, tip=replace(sensor.tip, disc_radius_px=markers.disc_radius_px))
         held_out, shown = markers.contacts(training, others, show)
         sets = {"fitted to": contacts, "train, held out": held_out}
-        if (data / "val").is_dir():
+        if split_folder(data, "val").is_dir():
             validation = read_split(data, "val")
             some = np.array(evenly(len(validation.images), _HELD_OUT))
             sets["val, held out"] = markers.contacts(validation, some, show)[0]

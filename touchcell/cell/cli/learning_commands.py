@@ -15,6 +15,7 @@ from touchcell.progress import shown_progress
 
 _SIMULATED_KINDS = ("gdn", "cnn", "markers")
 _TRAINING_LIMIT_S = 86_400
+_NAMED = 5
 _CANDIDATES = {
     "mean": "mean of the labels",
     "affine": "affine map",
@@ -130,7 +131,7 @@ def _add_calibration(commands: Subparsers) -> None:
     calibrate.add_argument("--model", type=Path, required=True, metavar="FILE", help="model file")
     _add_out(calibrate, "calibration file to write (.yaml)")
     source = calibrate.add_mutually_exclusive_group(required=True)
-    source.add_argument("--frames", type=Path, metavar="DIR", help="folder with PNG images of the tip out of contact")
+    source.add_argument("--frames", type=Path, metavar="DIR", help="folder with images of the tip out of contact")
     source.add_argument("--cell", type=Path, metavar="CELL", help="cell file whose sensor takes them now")
     calibrate.add_argument("--sensor", metavar="NAME", help="which sensor of the cell (default: its only one)")
     calibrate.add_argument(
@@ -281,7 +282,10 @@ def _adapt(options: argparse.Namespace) -> int:
         chosen = " (taken)" if name == result.method else ""
         print(f"  {_CANDIDATES[name]:<22}" + " ".join(f"{error:7.3f}" for error in errors) + chosen)
     for name in result.no_better:
-        print(f"warning: {name} is estimated no better than by its mean; give more images")
+        print(f"warning: {name} is estimated no better than by its mean; check its labels, or give more images")
+    if result.doubtful:
+        some = ", ".join(result.doubtful[:_NAMED]) + (", ..." if len(result.doubtful) > _NAMED else "")
+        print(f"warning: depth or tilt is far off the label in {len(result.doubtful)} images; check the rows of {some}")
     for region in result.missing:
         print(f"warning: no image with {region}")
     print(f"wrote {options.out}")

@@ -14,7 +14,7 @@ from touchcell.drivers.core.errors import ConnectError, StaleData
 from touchcell.drivers.core.protocols import TcpSource
 from touchcell.drivers.core.samples import Stamped, TcpState
 from touchcell.drivers.core.spec import Capabilities, DriverConfig, DriverContext, DriverSpec
-from touchcell.drivers.replay.dataset import natural_order, read_split
+from touchcell.drivers.replay.dataset import read_split
 from touchcell.errors import DataError
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
@@ -66,11 +66,10 @@ class ReplayArm(Device):
 
     def _open(self) -> None:
         try:
-            split = read_split(self._config.data, self._config.split)
+            split = read_split(self._config.data, self._config.split).in_order()
         except DataError as error:
             raise ConnectError(self.name, "the data set cannot be read", [error]) from None
-        order = sorted(range(len(split.images)), key=lambda i: natural_order(split.images[i]))
-        self._poses = se3.from_euler_mm_deg(split.contact_mm_deg[order])
+        self._poses = se3.from_euler_mm_deg(split.contact_mm_deg)
         self._start_ns = self._clock.now_ns()
 
     def _close(self) -> None:

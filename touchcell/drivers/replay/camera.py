@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 from pydantic import Field
 
 from touchcell.drivers.core.clock import Clock
@@ -21,7 +20,16 @@ from touchcell.drivers.core.errors import (
 from touchcell.drivers.core.protocols import FrameSource, HealthSource
 from touchcell.drivers.core.samples import Frame, Stamped
 from touchcell.drivers.core.spec import Capabilities, DriverConfig, DriverContext, DriverSpec
-from touchcell.drivers.replay.dataset import IMAGE_FOLDER, natural_order, split_folder
+from touchcell.drivers.replay.dataset import (
+    IMAGE_SUFFIXES,
+    image_folder_of,
+    label_file_of,
+    natural_order,
+    read_image,
+    read_split,
+    split_folder,
+)
+from touchcell.errors import DataError
 from touchcell.geometry.types import ImageArray
 from touchcell.input_file import InputFile
 
@@ -33,8 +41,6 @@ CAPABILITIES = Capabilities(
 )
 
 _READABLE = (Lifecycle.PASSIVE, Lifecycle.READY, Lifecycle.ACTIVE)
-# End markers of complete files: decoders silently fill the missing part of a truncated one with grey.
-_ENDINGS = {".png": b"IEND\xaeB`\x82", ".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9"}
 
 
 class ReplayCameraConfig(DriverConfig):
@@ -52,7 +58,10 @@ class ReplayCameraConfig(DriverConfig):
 
 
 class ReplayCamera(Device):
-    """Plays PNG and JPEG images in natural name order, image_2 before image_10.
+    """Plays PNG and JPEG images, and last frames of videos, in natural name order, image_2 before image_10.
+
+    Of a labelled split it plays, in grey, the images that have a label and no others, so that a replay arm reports the
+    pose of the image that is played.
 
     Image k is exposed k periods after ``connect``. As with a live camera, images that are not read in time are lost;
     they are not even opened. All images must have the same size.
@@ -65,7 +74,9 @@ class ReplayCamera(Device):
 
     def __init__(self, name: str, config: ReplayCameraConfig, clock: Clock) -> None:
         super().__init__(name, clock)
-        self._folder = split_folder(config.data, config.split) / IMAGE_FOLDER if config.split else config.data
+        self._config = config
+        split = config.split
+        self._folder = image_folder_of(split_folder(config.data, split)) if split else config.data
         self._period_ns = round(1e9 / config.rate_hz)
         self._files: list[Path] = []
         self._start_ns = 0
@@ -131,18 +142,12 @@ class ReplayCamera(Device):
         return self._newest
 
     def _decode(self, file: Path) -> ImageArray:
-        import cv2
-
         try:
-            data = file.read_bytes()
-        except OSError as error:
-            raise DeviceGone(self.name, f"cannot read {file}: {error.strerror}") from None
-        if not data.rstrip(b"\0").endswith(_ENDINGS[file.suffix.lower()]):
-            raise CorruptMessage(self.name, f"{file} is truncated or not a {file.suffix} image", hint="copy it again")
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_ANYCOLOR)
-        if image is None:
-            raise CorruptMessage(self.name, f"{file} is not a readable image")
-        return np.asarray(image, dtype=np.uint8)
+            return read_image(file, colour=self._config.split is None)
+        except DataError as error:
+            if not file.is_file():
+                raise DeviceGone(self.name, str(error)) from None
+            raise CorruptMessage(self.name, str(error)) from None
 
     def _open(self) -> None:
         if not self._folder.is_dir():
@@ -151,11 +156,20 @@ class ReplayCamera(Device):
                 f"{self._folder} is not a folder",
                 hint="give the folder that contains the images, or the data set and its split",
             )
-        files = (file for file in self._folder.iterdir() if file.suffix.lower() in _ENDINGS)
-        self._files = sorted(files, key=natural_order)
+        self._files = self._listed()
         if not self._files:
             raise ConnectError(self.name, f"{self._folder} contains no PNG or JPEG images")
         self._start_ns = self._clock.now_ns()
+
+    def _listed(self) -> list[Path]:
+        split = self._config.split
+        if split is not None and label_file_of(split_folder(self._config.data, split)) is not None:
+            try:
+                return list(read_split(self._config.data, split).in_order().images)
+            except DataError as error:
+                raise ConnectError(self.name, "the data set cannot be read", [error]) from None
+        files = (file for file in self._folder.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES)
+        return sorted(files, key=natural_order)
 
     def _close(self) -> None:
         self._files = []

@@ -1,9 +1,10 @@
 """Labelled tactile images on disk, in the layouts of the public TacTip releases.
 
 ``ROOT/SPLIT/processed_images/*`` and ``ROOT/SPLIT/targets_images.csv`` (or ``targets.csv``). SPLIT is one of train, val
-and test, or the same with ``_data`` at its end. Images are PNG or JPEG; a video stands for its last frame. The six
-labels are found by column name; other columns, and images without a row, are ignored. Where the images were cropped
-from the camera's frame, a JSON file beside them holds the rectangle.
+and test, or the same with ``_data`` at its end. Older releases name the folder images or videos, the image column
+sensor_video, and number the labels. Images are PNG or JPEG; a video stands for its last frame. The six labels are found
+by column name; other columns, and images without a row, are ignored. Where the images were cropped from the camera's
+frame, a JSON file beside them holds the rectangle.
 """
 
 from __future__ import annotations
@@ -26,6 +27,8 @@ from touchcell.geometry.types import Array, ImageArray
 
 LABEL_FILES = ("targets_images.csv", "targets.csv")
 IMAGE_FOLDER = "processed_images"
+IMAGE_FOLDERS = (IMAGE_FOLDER, "images", "sensor_images", "videos")
+"""Folders of a split that may hold its images; the first that exists does."""
 PARAMETER_FILES = ("processed_image_params.json", "process_image_params.json")
 """Files beside the labels, or beside the splits, that hold ``bbox``: left, top, right, bottom of the crop, px."""
 VIDEO_SUFFIXES = (".mp4", ".avi", ".mkv")
@@ -35,9 +38,13 @@ REST_IMAGE = "rest.png"
 """File beside the splits, if present: the image out of contact."""
 LABEL_COLUMNS = ("shear_x", "shear_y", "pose_z", "pose_Rx", "pose_Ry", "shear_Rz")
 """Columns that hold x, y, z, alpha, beta, gamma of ``T_f_s``, mm and degrees."""
+_OTHER_IMAGE_COLUMNS = ("sensor_video",)
+_OTHER_LABEL_COLUMNS = ("shear_1", "shear_2", "pose_3", "pose_4", "pose_5", "shear_6")
+_BOX = re.compile(r"bbox\W*?\[([^\]]*)\]")
 
 _PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
 _LEAST_OF_16_BITS = 4096
+_MOST_MM_DEG = 180.0
 
 
 @dataclass(frozen=True)
@@ -77,6 +84,11 @@ class Split:
                 )
             yield image
 
+    def in_order(self) -> Split:
+        """Return this split in the natural order of the images' names, in which a data set is replayed."""
+        order = sorted(range(len(self.images)), key=lambda i: natural_order(self.images[i]))
+        return replace(self, images=tuple(self.images[i] for i in order), contact_mm_deg=self.contact_mm_deg[order])
+
     def deeper_than(self, depth_mm: float) -> Split:
         """Return the contacts of this split with a larger indentation. Raises DataError if there are none."""
         kept = np.flatnonzero(self.contact_mm_deg[:, 2] > depth_mm)
@@ -90,17 +102,17 @@ def read_split(root: Path, split: str) -> Split:
 
     Raises:
         DataError: the folder, the split, the label file, a column or an image is missing; the split is empty; a label
-            is not a finite number; two rows name one image.
+            is not a finite number or beyond 180 mm or degrees; two rows name one image; a row has more or fewer values.
     """
     folder = split_folder(root, split)
     if not folder.is_dir():
         found = sorted(path.name for path in root.iterdir() if path.is_dir()) if root.is_dir() else []
         hint = f"splits there: {', '.join(found)}" if found else "give the folder that holds train, val and test"
         raise DataError(folder, "no such folder", hint=hint)
-    table = next((folder / name for name in LABEL_FILES if (folder / name).is_file()), None)
+    table = label_file_of(folder)
     if table is None:
         raise DataError(folder, f"no label file {' or '.join(LABEL_FILES)}")
-    image_folder = folder / IMAGE_FOLDER
+    image_folder = image_folder_of(folder)
     if not image_folder.is_dir():
         raise DataError(image_folder, "no such folder", hint="this folder holds the images of a split")
     present = {path.name for path in image_folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES}
@@ -110,20 +122,22 @@ def read_split(root: Path, split: str) -> Split:
     seen: set[str] = set()
     with _open_table(table) as stream:
         rows = csv.DictReader(stream, skipinitialspace=True)
-        for column in (IMAGE_COLUMN, *LABEL_COLUMNS):
-            if column not in (rows.fieldnames or ()):
-                raise DataError(table, "missing column", row=1, column=column)
+        image_column, columns = _columns(table, rows)
         for row in rows:
-            name = row[IMAGE_COLUMN] or ""
+            if not any(cell for cell in row.values() if isinstance(cell, str) and cell.strip()):
+                continue
+            if None in row or None in row.values():
+                raise DataError(table, "more or fewer values than columns", row=rows.line_num)
+            name = row[image_column].strip()
             if name not in present:
-                raise DataError(
-                    table, f"image {name!r} is not in {image_folder}", row=rows.line_num, column=IMAGE_COLUMN
-                )
+                known = f"is none of {', '.join(IMAGE_SUFFIXES)}"
+                reason = known if name and (image_folder / name).is_file() else f"is not in {image_folder}"
+                raise DataError(table, f"image {name!r} {reason}", row=rows.line_num, column=image_column)
             if name in seen:
-                raise DataError(table, f"image {name!r} has two rows", row=rows.line_num, column=IMAGE_COLUMN)
+                raise DataError(table, f"image {name!r} has two rows", row=rows.line_num, column=image_column)
             seen.add(name)
             names.append(name)
-            labels.append([_number(row[column], table, rows.line_num, column) for column in LABEL_COLUMNS])
+            labels.append([_number(row[column], table, rows.line_num, column) for column in columns])
     if not names:
         raise DataError(table, "no rows", hint="the split is empty")
     return Split(
@@ -141,6 +155,32 @@ def split_folder(root: Path, split: str) -> Path:
     return other if other.is_dir() and not folder.is_dir() else folder
 
 
+def image_folder_of(folder: Path) -> Path:
+    """Return the folder of a split's images, whether or not there is one."""
+    found = (folder / name for name in IMAGE_FOLDERS if (folder / name).is_dir())
+    return next(found, folder / IMAGE_FOLDER)
+
+
+def label_file_of(folder: Path) -> Path | None:
+    """Return the label file of a split; None where it has none."""
+    return next((folder / name for name in LABEL_FILES if (folder / name).is_file()), None)
+
+
+def _columns(table: Path, rows: csv.DictReader[str]) -> tuple[str, tuple[str, ...]]:
+    """Return the columns of the image and of the six labels. Raises DataError where one is missing or stands twice."""
+    names = [name.strip() for name in rows.fieldnames or ()]
+    rows.fieldnames = names
+    image = next((name for name in (IMAGE_COLUMN, *_OTHER_IMAGE_COLUMNS) if name in names), IMAGE_COLUMN)
+    numbered = not any(name in names for name in LABEL_COLUMNS) and _OTHER_LABEL_COLUMNS[0] in names
+    columns = _OTHER_LABEL_COLUMNS if numbered else LABEL_COLUMNS
+    for name in (image, *columns):
+        if name not in names:
+            raise DataError(table, "missing column", row=1, column=name, hint=f"columns there: {', '.join(names)}")
+        if names.count(name) > 1:
+            raise DataError(table, "two columns of this name", row=1, column=name)
+    return image, columns
+
+
 def _crop(folder: Path) -> tuple[int, int, int, int] | None:
     """Return the crop that a split's parameter file records. Raises DataError where it is not a rectangle."""
     files = [place / name for place in (folder, folder.parent) for name in PARAMETER_FILES]
@@ -148,10 +188,16 @@ def _crop(folder: Path) -> tuple[int, int, int, int] | None:
     if file is None:
         return None
     try:
-        fields = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+        text = file.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
         raise DataError(file, f"cannot be read: {error}") from error
-    box = fields.get("bbox") if isinstance(fields, dict) else None
+    try:
+        fields = json.loads(text)
+        box = fields.get("bbox") if isinstance(fields, dict) else None
+    except ValueError:
+        # Some published files have a bracket too many or a quote too few, which is no reason to refuse their images.
+        numbers = _BOX.search(text)
+        box = [int(each) for each in re.findall(r"-?\d+", numbers[1])] if numbers else None
     if box is None:
         return None
     whole = isinstance(box, list) and len(box) == 4 and all(type(each) is int for each in box)
@@ -167,8 +213,10 @@ def read_rest(root: Path) -> ImageArray | None:
     return read_image(path) if path.exists() else None
 
 
-def read_image(path: Path) -> ImageArray:
+def read_image(path: Path, *, colour: bool = False) -> ImageArray:
     """Read a PNG or JPEG image, or the last frame of a video, as uint8 grey (height, width).
+
+    With ``colour``, images in colour stay as they are: uint8 (height, width, 3), blue first.
 
     Of 16 bits per pixel the upper eight are kept, which hold nothing where a camera of 10 or 12 bits wrote its values
     unscaled: such an image is refused.
@@ -179,7 +227,7 @@ def read_image(path: Path) -> ImageArray:
     import cv2
 
     if path.suffix.lower() in VIDEO_SUFFIXES:
-        return _last_frame(path)
+        return _last_frame(path, colour)
     try:
         encoded = path.read_bytes()
     except OSError as error:
@@ -189,9 +237,9 @@ def read_image(path: Path) -> ImageArray:
     jpeg = encoded.startswith(_JPEG) and encoded.rstrip(b"\0").endswith(b"\xff\xd9")
     if not (png or jpeg):
         raise DataError(path, "not a complete PNG or JPEG image", hint="copy the data set again")
-    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
+    flags = (cv2.IMREAD_ANYCOLOR if colour else cv2.IMREAD_GRAYSCALE) | cv2.IMREAD_ANYDEPTH
     image = cv2.imdecode(np.frombuffer(encoded, dtype=np.uint8), flags)
-    if image is None or (png and image.shape != struct.unpack(">II", encoded[16:24])[::-1]):
+    if image is None or (png and image.shape[:2] != struct.unpack(">II", encoded[16:24])[::-1]):
         raise DataError(path, "corrupt image", hint="copy the data set again")
     if image.dtype == np.uint16:
         if 0 < image.max() < _LEAST_OF_16_BITS:
@@ -204,7 +252,7 @@ def read_image(path: Path) -> ImageArray:
     return cast(ImageArray, image)
 
 
-def _last_frame(path: Path) -> ImageArray:
+def _last_frame(path: Path, colour: bool) -> ImageArray:
     if not path.is_file():
         raise DataError(path, "cannot be read: no such file")
     import cv2
@@ -217,7 +265,7 @@ def _last_frame(path: Path) -> ImageArray:
         video.release()
     if last is None:
         raise DataError(path, "not a video that can be decoded", hint="copy the data set again, or save images")
-    return cast(ImageArray, cv2.cvtColor(last, cv2.COLOR_BGR2GRAY) if last.ndim == 3 else last)
+    return cast(ImageArray, cv2.cvtColor(last, cv2.COLOR_BGR2GRAY) if last.ndim == 3 and not colour else last)
 
 
 def natural_order(path: Path) -> list[tuple[int, str]]:
@@ -240,6 +288,14 @@ def _number(text: str | None, table: Path, row: int, column: str) -> float:
         value = math.nan
     if not math.isfinite(value):
         raise DataError(table, f"{text!r} is not a finite number", row=row, column=column)
+    if abs(value) > _MOST_MM_DEG:
+        raise DataError(
+            table,
+            f"{value:g} is no contact of such a sensor",
+            row=row,
+            column=column,
+            hint="labels are in mm and degrees, about the surface that is touched",
+        )
     return value
 
 

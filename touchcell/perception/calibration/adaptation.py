@@ -11,8 +11,8 @@ beats both.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Literal
@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from touchcell.drivers.replay.dataset import read_image, read_split
+from touchcell.drivers.replay.dataset import read_split
 from touchcell.geometry.types import Array
 from touchcell.perception.calibration.marked_data import evenly
 from touchcell.perception.calibration.transfer_fit import (
@@ -35,7 +35,7 @@ from touchcell.perception.calibration.transfer_fit import (
 )
 from touchcell.perception.errors import ModelError, TrainingError
 from touchcell.perception.markers.camera_check import transferred_check
-from touchcell.perception.markers.detection import Discs, detect_markers, typical_size
+from touchcell.perception.markers.detection import Discs, detect_markers
 from touchcell.perception.markers.estimator import displacement_model_of, matcher_of
 from touchcell.perception.markers.lattice_fit import fit_lattice
 from touchcell.perception.markers.layers import layers_of, mixed
@@ -48,10 +48,10 @@ from touchcell.perception.models.model_file import Header, Labels, Model, load_m
 from touchcell.perception.models.preprocessing import Preprocessing
 from touchcell.perception.networks.contact_network import Alignment
 from touchcell.perception.networks.displacement_network import DisplacementNetwork, Jitter, displacement_loss
-from touchcell.perception.networks.marker_training import LabelledDiscs, preprocessing_for
+from touchcell.perception.networks.marker_training import LabelledDiscs, preprocessing_and_size
 from touchcell.perception.networks.sigma_scaling import calibrate
 
-_SHALLOW = 10
+_SHALLOW, _LOOKED_AT = 10, 200
 _FEWEST = 10
 _MATCHED = 0.5
 _MOST_PROCESS_CONTACTS = 400
@@ -59,6 +59,11 @@ _FOLDS, _FEW = 4, 120
 _RIDGE = 0.01
 _TAIL_SCALE = 0.6  # Of models that were calibrated on thousands of contacts.
 _SECTORS = 8
+# A real second sensor has correlations of 0.96, 1.00 and 0.67; of ten images at least 0.87, 0.98 and 0.30.
+_LEAST_SIMILAR_DEPTH, _LEAST_SIMILAR_TILT, _LEAST_SIMILAR_SHEAR = 0.6, 0.7, 0.25
+_LEAST_DEPTH_RATIO, _LEAST_TILT_RATIO = 0.05, 0.05
+_USEFUL = 0.8
+_DOUBTFUL, _FAR = 12.0, 5.0
 
 Method = Literal["transfer", "scratch"]
 
@@ -103,6 +108,7 @@ class Adapted:
         images, matched: number of images, and of those with reliable markers.
         missing: one sentence for each region of contacts without images.
         no_better: components that are estimated no better than by their mean.
+        doubtful: images whose depth or tilt, estimated without them, is many times farther off the label than usual.
     """
 
     model: Model
@@ -113,6 +119,7 @@ class Adapted:
     matched: int
     missing: tuple[str, ...]
     no_better: tuple[str, ...]
+    doubtful: tuple[str, ...]
 
 
 def adapt(
@@ -146,14 +153,15 @@ def adapt(
     split = read_split(data, "train")
     by_depth = np.argsort(split.contact_mm_deg[:, 2], kind="stable")
     chosen = by_depth[evenly(len(by_depth), len(by_depth) if frames is None else frames)]
-    images = [read_image(split.images[i]) for i in chosen]
-    preprocessing = preprocessing_for(images[0])
-    size = typical_size(preprocessing.reduce(images[0]))
+    split = replace(split, images=tuple(split.images[i] for i in chosen), contact_mm_deg=split.contact_mm_deg[chosen])
+    images = list(split.read())
+    preprocessing, size = preprocessing_and_size(images)
     dataset = LabelledDiscs(
         [detect_markers(preprocessing.reduce(image), size) for image in images],
-        xi_from_contact(split.contact_mm_deg[chosen]),
+        xi_from_contact(split.contact_mm_deg),
     )
-    adapted = adapt_to(old, dataset, preprocessing=preprocessing, size=size, settings=settings)
+    names = [path.name for path in split.images]
+    adapted = adapt_to(old, dataset, preprocessing=preprocessing, size=size, settings=settings, names=names)
     save_model(adapted.model, out)
     return adapted
 
@@ -165,14 +173,22 @@ def adapt_to(
     preprocessing: Preprocessing,
     size: MarkerSize,
     settings: AdaptSettings | None = None,
+    names: Sequence[str] = (),
 ) -> Adapted:
-    """Return the model for another sensor, from discs in memory. Arguments as of the model; raises as ``adapt``."""
+    """Return the model for another sensor, from discs in memory. Arguments as of the model; raises as ``adapt``.
+
+    ``names`` are the images', for ``Adapted.doubtful``; without them these are numbers.
+    """
     settings = settings or AdaptSettings()
     camera, displacements, matched = align_camera(old, dataset)
     if matched.sum() < _FEWEST:
         raise TrainingError(f"{int(matched.sum())} images could be matched, {_FEWEST} are needed", hint="give more")
     contacts = contact_from_xi(dataset.xi[matched])
     candidates = _Candidates(old, displacements[matched], contacts, settings)
+    used = np.flatnonzero(matched)
+    refuse_outliers(contacts, [names[i] if names else f"image {i}" for i in used])
+    convention = find_convention(candidates.outputs, contacts)
+    refuse_unlike(candidates.outputs, contacts, convention)
     method, left_out = candidates.judged()
     update: dict[str, object] = {"input_size": preprocessing.output_size, "size": size}
     architecture = old.header.architecture
@@ -217,18 +233,73 @@ def adapt_to(
         tensors,
     )
     mean = left_out["mean"]
+    numbers = used[candidates.doubtful(method)]
     return Adapted(
         model=model,
         method=method,
         left_out_mae=left_out,
-        convention=find_convention(candidates.outputs, contacts),
+        convention=convention,
         images=len(dataset.frames),
         matched=int(matched.sum()),
         missing=missing_contacts(contacts),
         no_better=tuple(
             name for name, error, limit in zip(CONTACT_NAMES, left_out[method], mean, strict=True) if error >= limit
         ),
+        doubtful=tuple(names[i] if names else str(i) for i in numbers),
     )
+
+
+def refuse_outliers(contacts: Array, names: Sequence[str]) -> None:
+    """Raise TrainingError where a label of contacts (n, 6) is far from all others, with the image's name."""
+    low, middle, high = np.quantile(contacts, [0.1, 0.5, 0.9], axis=0)
+    off = np.abs(contacts - middle) / np.maximum(high - low, 1e-6)
+    i, component = np.unravel_index(int(np.argmax(off)), off.shape)
+    if off[i, component] > _FAR:
+        raise TrainingError(
+            f"{names[i]}: {CONTACT_NAMES[component]} of {contacts[i, component]:g} is far from all others",
+            hint="check the row of this image",
+        )
+
+
+def refuse_unlike(outputs: Array, contacts: Array, convention: Convention) -> None:
+    """Refuse labels that cannot be of these images, whatever their convention.
+
+    Args:
+        outputs: (n, 6) of the old networks, mm and degrees.
+        contacts: (n, 6) labels.
+        convention: in which they are most similar.
+
+    Raises:
+        TrainingError: the labels are in other units, or their depth, tilt or shear is unlike what the images show.
+    """
+    spread = contacts.std(axis=0) / np.maximum(outputs.std(axis=0), 1e-9)
+    for name, ratio, least, unit in (
+        ("depth", spread[2], _LEAST_DEPTH_RATIO, "mm"),
+        ("tilt", float(np.hypot(*spread[3:5])) / math.sqrt(2.0), _LEAST_TILT_RATIO, "degrees"),
+    ):
+        if not least < ratio < 1.0 / least:
+            raise TrainingError(
+                f"the labels' {name} varies {ratio:.2g} times as much as the images show",
+                hint=f"labels are in mm and degrees, {name} in {unit}",
+            )
+    depth = float(np.corrcoef(outputs[:, 2], contacts[:, 2])[0, 1])
+    if depth < -_LEAST_SIMILAR_DEPTH:
+        raise TrainingError(
+            "the labels' depth is smaller where the images show deeper contacts",
+            hint="depth (pose_z) is positive, and grows into the surface",
+        )
+    found = (
+        ("depth", depth, _LEAST_SIMILAR_DEPTH),
+        ("tilt", convention.tilt_explained, _LEAST_SIMILAR_TILT),
+        ("shear", convention.shear_explained, _LEAST_SIMILAR_SHEAR),
+    )
+    unlike = [name for name, similar, least in found if similar < least]
+    if unlike:
+        figures = ", ".join(f"{name} {similar:.2f}" for name, similar, _ in found)
+        raise TrainingError(
+            f"the labels' {' and '.join(unlike)} cannot be what the images show (correlation: {figures})",
+            hint="check which column is which, and which image belongs to which row",
+        )
 
 
 def align_camera(old: Model, dataset: LabelledDiscs) -> tuple[CameraChange, NDArray[np.float32], NDArray[np.bool_]]:
@@ -246,10 +317,14 @@ def align_camera(old: Model, dataset: LabelledDiscs) -> tuple[CameraChange, NDAr
     assert isinstance(architecture, MarkerArchitecture)
     matcher = matcher_of(old, architecture)
     old_lattice = matcher.model.reference
-    depth = contact_from_xi(dataset.xi)[:, 2]
-    fits = [fit_lattice(dataset.frames[i], architecture.rings) for i in np.argsort(depth)[:_SHALLOW]]
-    lattice, rms = min(fits, key=lambda each: each[1])
-    if not np.isfinite(rms):
+    by_depth = np.argsort(contact_from_xi(dataset.xi)[:, 2])
+    # Labels may be of other images; then a shallow contact is among the others.
+    for some in (by_depth[:_SHALLOW], by_depth[_SHALLOW:]):
+        fits = [fit_lattice(dataset.frames[i], architecture.rings) for i in some[:_LOOKED_AT]]
+        lattice, rms = min(fits, key=lambda each: each[1], default=(old_lattice, np.inf))
+        if np.isfinite(rms):
+            break
+    else:
         raise TrainingError(
             f"no lattice of {architecture.rings} rings found in the shallowest images",
             hint="only a sensor of the same kind can be adapted to; give an image of hardly any contact",
@@ -341,6 +416,8 @@ class _Candidates:
         errors = {name: np.abs(each).mean(axis=0) for name, each in off.items()}
         relative = {name: float((each / errors["mean"]).mean()) for name, each in errors.items()}
         method: Method = "transfer" if relative["transfer"] <= relative["scratch"] else "scratch"
+        # Of labels that say nothing, one candidate or other is a little better than their mean by chance.
+        relative["mean"] *= _USEFUL
         simple = min(("mean", "affine"), key=lambda name: relative[name])
         if relative[method] >= relative[simple]:
             what = "predicting the mean of the labels" if simple == "mean" else "an affine map of the old outputs"
@@ -349,6 +426,21 @@ class _Candidates:
                 hint="check the labels (columns, order, which image belongs to which row), or give more images",
             )
         return method, errors
+
+    def doubtful(self, method: Method) -> NDArray[np.intp]:
+        """Return the indices of contacts whose label is off the chosen candidate's estimate without them.
+
+        By many times the usual error, and by more than the labels vary.
+        """
+        residual = self._residual
+        if method == "scratch":
+            residual = self._contacts - self.labels.contacts(self._scratch_mean)
+        off = np.abs(residual[:, 2:5])
+        guessed = np.abs(self._contacts - np.median(self._contacts, axis=0)).mean(axis=0)[2:5]
+        far: NDArray[np.intp] = np.flatnonzero(
+            (off > np.maximum(_DOUBTFUL * np.median(off, axis=0), guessed)).any(axis=1)
+        )
+        return far
 
     def transfer(self) -> Transfer:
         """Return the processes fitted to all contacts, with sigmas from the left-out ones."""

@@ -14,12 +14,12 @@ from touchcell.drivers.replay.dataset import FRAME_SIZE, PUBLIC_CROP, Split, rea
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array, ImageArray
 from touchcell.perception.errors import ImageError
-from touchcell.perception.markers.detection import detect_markers, typical_size
+from touchcell.perception.markers.detection import detect_markers
 from touchcell.perception.markers.matching import MarkerField, MarkerMatcher
 from touchcell.perception.models.marker_architecture import MarkerSize
 from touchcell.perception.models.preprocessing import Preprocessing
 from touchcell.perception.networks.marker_learning import learn_markers
-from touchcell.perception.networks.marker_training import preprocessing_for
+from touchcell.perception.networks.marker_training import preprocessing_and_size
 
 _BELIEVED = 0.97
 
@@ -125,8 +125,7 @@ def learn_sensor(
     chosen = [split.images[i] for i in evenly(len(split.images), images)]
     first = read_image(chosen[0])
     origin = frame_origin((first.shape[0], first.shape[1]), split.crop)
-    preprocessing = preprocessing_for(first)
-    size = typical_size(preprocessing.reduce(first))
+    preprocessing, size = preprocessing_and_size(map(read_image, chosen))
     discs = []
     for i, path in enumerate(chosen):
         discs.append(detect_markers(preprocessing.reduce(read_image(path)), size))

@@ -21,9 +21,12 @@ from touchcell.perception.markers.transfer import (
     features,
     kernel,
     lattice_symmetries,
+    learned_features,
     plane,
     process_results,
     reflected,
+    ring_modes,
+    ring_weights,
     symmetric_fields,
     symmetric_outputs,
     turned_back,
@@ -32,8 +35,8 @@ from touchcell.perception.models.model_file import Labels
 from touchcell.perception.models.transfer_spec import BLOCKS, BlockSpec, TransferSpec
 
 COMPONENTS = 12
-_START = (0.7, -1.2, -1.2, 0.7, -1.2, -1.5, -1.5, 0.5, -0.7, 0.0, -1.2, -1.2)
-_PRIOR_SD = (0.6, 1.0, 1.0, 0.6, 1.0, 1.0, 1.0, 0.6, 1.0, 1.0, 1.0, 1.0)
+_START = (0.7, -2.0, -2.0, 0.7, -2.0, -2.0, -2.0, 0.5, -0.7, 0.0, -1.2, -1.2, -0.5, -0.5)
+_PRIOR_SD = (0.6, 1.0, 1.0, 0.6, 1.0, 1.0, 1.0, 0.6, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0)
 _STEPS = 80
 _JITTER = 1e-5
 _BANKED = 200
@@ -49,7 +52,7 @@ class OldSensor:
         labels: of the networks.
         reference: (m, 2) px, its lattice.
         symmetries: of the lattice.
-        image_turn, mirror_axes_rad: as of ``TransferSpec``.
+        image_turn, mirror_axes_rad, ring_turn_rad: as of ``TransferSpec``.
     """
 
     layers: Layers
@@ -58,6 +61,7 @@ class OldSensor:
     symmetries: tuple[Symmetry, ...]
     image_turn: Literal[-1, 1]
     mirror_axes_rad: tuple[float, float]
+    ring_turn_rad: float
 
     def outputs(self, displacements: NDArray[Any]) -> tuple[Array, Array]:
         """Return ``symmetric_outputs`` for displacements (n, 2 m) px."""
@@ -91,7 +95,10 @@ def old_sensor(layers: Layers, labels: Labels, model: DisplacementModel, bank: A
         0.5 * float(np.angle(np.vdot(plane(reflected_, first).conj(), plane(plain, first)))) for first in (SHEAR, TILT)
     ]
     image_turn: Literal[-1, 1] = 1 if errors[1] <= errors[-1] else -1
-    return OldSensor(layers, labels, model.reference, symmetries, image_turn, (axes[0], axes[1]))
+    shift = ring_modes(displacements, ring_weights(model.reference))[:, :, 0].mean(axis=1)
+    shift = shift if image_turn > 0 else shift.conj()
+    turn = float(np.angle(np.vdot(shift, plane(plain, SHEAR))))
+    return OldSensor(layers, labels, model.reference, symmetries, image_turn, (axes[0], axes[1]), turn)
 
 
 @dataclass(frozen=True)
@@ -101,13 +108,14 @@ class Convention:
     Attributes:
         mirrored: in a mirror.
         shear_axes_rad, tilt_axes_rad: angles from the networks' vectors to the labels'.
-        explained: fraction of the labels' shear and tilt that this convention explains, without any fit of magnitudes.
+        shear_explained, tilt_explained: correlation of the labels' shear and tilt with the outputs', as vectors.
     """
 
     mirrored: bool
     shear_axes_rad: float
     tilt_axes_rad: float
-    explained: float
+    shear_explained: float
+    tilt_explained: float
 
     @property
     def shear_reversed(self) -> bool:
@@ -119,15 +127,15 @@ def find_convention(outputs: Array, contacts: Array) -> Convention:
     """Return the convention, mirrored or not, in which outputs (n, 6) are most similar to labels (n, 6), mm, deg."""
     found = []
     for mirrored in (False, True):
-        angles, explained = [], 0.0
+        angles, explained = [], []
         for first in (SHEAR, TILT):
             a, b = plane(reflected(outputs) if mirrored else outputs, first), plane(contacts, first)
             a, b = a - a.mean(), b - b.mean()
             product = complex(np.vdot(a, b))
             angles.append(float(np.angle(product)))
-            explained += abs(product) / max(float(np.linalg.norm(a) * np.linalg.norm(b)), 1e-12) / 2
-        found.append(Convention(mirrored, angles[0], angles[1], explained))
-    return max(found, key=lambda each: each.explained)
+            explained.append(abs(product) / max(float(np.linalg.norm(a) * np.linalg.norm(b)), 1e-12))
+        found.append(Convention(mirrored, *angles, *explained))
+    return max(found, key=lambda each: each.shear_explained + each.tilt_explained)
 
 
 @dataclass(frozen=True)
@@ -137,16 +145,19 @@ class Transfer:
     Attributes:
         spec: their parameters.
         tensors: of the model file.
+        reference: (m, 2) px, lattice of the old sensor.
     """
 
     spec: TransferSpec
     tensors: dict[str, Array]
+    reference: Array
 
     def __call__(self, outputs: Array, displacements: NDArray[Any]) -> tuple[Array, Array]:
         """Return contacts (n, 6) and the processes' standard deviations (n, 6), mm and degrees."""
         scores = (displacements - self.tensors["transfer.mean"]) @ self.tensors["transfer.basis"].T
-        at = features(self.spec, reflected(outputs) if self.spec.mirrored else outputs, scores)
-        learned = features(self.spec, self.tensors["transfer.outputs"], self.tensors["transfer.scores"])
+        rings = ring_modes(displacements, ring_weights(self.reference))
+        at = features(self.spec, reflected(outputs) if self.spec.mirrored else outputs, scores, rings)
+        learned = learned_features(self.spec, self.tensors)
         return process_results(self.spec, self.tensors, at, learned)
 
 
@@ -172,6 +183,8 @@ def fit_transfer(old: OldSensor, outputs: Array, displacements: NDArray[Any], co
     magnitude = {first: float(np.abs(plane(seen, first)).mean()) for first in (SHEAR, TILT)}
     if min(*magnitude.values(), float(seen.std(axis=0).min()), float(contacts.std(axis=0).min())) < 1e-9:
         raise TrainingError("labels or outputs of the old networks do not vary", hint="collect varied contacts")
+    rings = ring_modes(displacements, ring_weights(old.reference))
+    units = np.sqrt((np.abs(rings) ** 2).mean(axis=0)) + 1e-9
     placeholder = BlockSpec(kernel=_START, mean=0.0, unit=1.0)
     spec = TransferSpec(
         markers=len(old.reference),
@@ -189,15 +202,18 @@ def fit_transfer(old: OldSensor, outputs: Array, displacements: NDArray[Any], co
         output_mean=_six(seen.mean(axis=0)),
         output_sd=_six(seen.std(axis=0)),
         component_unit_px=float(scores.std()),
+        ring_turn_rad=old.ring_turn_rad,
+        ring_units_px=tuple(units.ravel().tolist()),
         blocks=(placeholder,) * 4,
         network_share=(0.0,) * 6,
         process_share=(1.0,) * 6,
         floor=(0.0,) * 6,
     )
-    learned = features(spec, seen, scores)
+    learned = features(spec, seen, scores, rings)
     tensors = {
         "transfer.outputs": seen,
         "transfer.scores": scores,
+        "transfer.rings": np.stack([rings.real, rings.imag], axis=-1),
         "transfer.mean": mean,
         "transfer.basis": basis,
     }
@@ -206,7 +222,7 @@ def fit_transfer(old: OldSensor, outputs: Array, displacements: NDArray[Any], co
         block, weights, inverse = _fit_block(name, learned, _targets(name, convention, contacts))
         blocks.append(block)
         tensors |= {f"transfer.{name}.weights": weights, f"transfer.{name}.inverse": inverse}
-    return Transfer(spec.model_copy(update={"blocks": tuple(blocks)}), tensors)
+    return Transfer(spec.model_copy(update={"blocks": tuple(blocks)}), tensors, old.reference)
 
 
 def with_sigma(transfer: Transfer, residual: Array, network: Array, process: Array) -> Transfer:

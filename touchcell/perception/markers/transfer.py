@@ -3,9 +3,9 @@
 A tip is nearly symmetric: when its markers turn or are reflected, shear and tilt turn or are reflected with them. So
 the old networks are evaluated for the twelve symmetric copies of a marker field, and the mean of their results, turned
 back, serves as a feature. The processes' covariance is a sum of one that is exactly symmetric - a vector is a sum of
-the networks' shear and tilt vectors, with coefficients that depend on depth and magnitudes - and one without symmetry,
-of those features and the first principal components of the new sensor's displacements, for what its mount and camera
-break of it. Exact inference as in Rasmussen & Williams 2006, chapter 2.
+the networks' shear and tilt vectors and of what rings of markers do, with coefficients that depend on depth and
+magnitudes - and one without symmetry, of those features and the first principal components of the new sensor's
+displacements, for what its mount and camera break of it. Exact inference as in Rasmussen & Williams 2006, chapter 2.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from touchcell.geometry.types import Array
-from touchcell.perception.markers.detection import lattice, rings_of
+from touchcell.perception.markers.detection import lattice, ring_numbers, rings_of
 from touchcell.perception.markers.layers import Layers, outputs_of
 from touchcell.perception.models.labels import XI_UNITS
 from touchcell.perception.models.model_file import Labels, Model
-from touchcell.perception.models.transfer_spec import BLOCKS, PAIRS, TransferSpec
+from touchcell.perception.models.transfer_spec import BANDS, BLOCKS, PAIRS, TransferSpec
 
 SHEAR, TILT = 0, 3
 
@@ -120,6 +120,12 @@ def symmetric_outputs(
     return np.mean(back, axis=0), sigma[:n] * unit
 
 
+def learned_features(spec: TransferSpec, tensors: dict[str, Array]) -> Features:
+    """Return the inputs at the labelled contacts."""
+    rings = tensors["transfer.rings"]
+    return features(spec, tensors["transfer.outputs"], tensors["transfer.scores"], rings[..., 0] + 1j * rings[..., 1])
+
+
 @dataclass(frozen=True)
 class Features:
     """Inputs of the Gaussian processes.
@@ -130,6 +136,8 @@ class Features:
         vectors: (2, n, 4) that turn with the tip.
         outputs: (n, 6) standardised outputs of the networks.
         scores: (n, k) principal components of the displacements.
+        ring_vectors: (2, n, 2 bands) ``ring_modes`` that turn with the tip.
+        ring_scalars, ring_odd: (n, bands) those that stay, and those that change sign in a mirror.
     """
 
     invariants: Any
@@ -137,21 +145,66 @@ class Features:
     vectors: Any
     outputs: Any
     scores: Any
+    ring_vectors: Any
+    ring_scalars: Any
+    ring_odd: Any
 
 
-def features(spec: TransferSpec, outputs: Array, scores: Array) -> Features:
-    """Return the inputs for outputs (n, 6) of the networks, mm and degrees, and components (n, k) px."""
+def ring_weights(reference: Array) -> NDArray[np.complex128]:
+    """Return the (bands, 3, m) weights of the markers of a lattice (m, 2) px in ``ring_modes``."""
+    place = (reference - reference.mean(axis=0)) @ np.array([1.0, 1.0j])
+    around = np.exp(-1j * np.angle(place))
+    number = ring_numbers(rings_of(len(reference)))
+    bands = np.array_split(np.unique(number[number > 0]), min(BANDS, int(number.max())))
+    inside = [np.isin(number, band) for band in bands]
+    return np.array([[each * around**mode / each.sum() for mode in range(3)] for each in inside])
+
+
+def ring_modes(displacements: NDArray[Any], weights: NDArray[np.complex128]) -> NDArray[np.complex128]:
+    """Return (n, bands, 3) px: how far marker displacements (n, 2 m) px shift, widen and turn, and bend bands of rings.
+
+    The displacement u + i v along a ring is a Fourier series in the polar angle. When the markers turn with the tip,
+    coefficient 0, the shift of the ring, turns with them; so does the conjugate of coefficient 2. Coefficient 1 stays:
+    its real part is radial, its imaginary one tangential.
+
+    Args:
+        displacements: of the markers.
+        weights: of ``ring_weights``.
+    """
+    moved = displacements.reshape(len(displacements), -1, 2) @ np.array([1.0, 1.0j])
+    modes = np.einsum("nm,bkm->nbk", moved, weights)
+    modes[:, :, 2] = modes[:, :, 2].conj()
+    return modes.astype(np.complex128)
+
+
+def features(spec: TransferSpec, outputs: Array, scores: Array, rings: NDArray[np.complex128]) -> Features:
+    """Return the inputs of the processes.
+
+    Args:
+        spec: units and convention.
+        outputs: (n, 6) of the networks, mm and degrees.
+        scores: (n, k) px components of the displacements.
+        rings: (n, bands, 3) px, of ``ring_modes``.
+    """
     shear, tilt = plane(outputs, SHEAR) / spec.shear_unit_mm, 1j * plane(outputs, TILT) / spec.tilt_unit_deg
     torsion = outputs[:, 5] / spec.torsion_unit_deg
     depth = (outputs[:, 2] - spec.output_mean[2]) / spec.depth_unit_mm
     product = shear.conj() * tilt
     vectors = np.stack([shear, tilt, 1j * torsion * shear, 1j * torsion * tilt], axis=1)
+    units = np.array(spec.ring_units_px).reshape(-1, 3)
+    turning = np.exp(1j * spec.ring_turn_rad) * (rings if spec.image_turn > 0 else rings.conj())
+    turning = turning.conj() if spec.mirrored else turning
+    turning = (turning / units)[:, :, [0, 2]].reshape(len(rings), -1)
+    staying = rings[:, :, 1] / units[:, 1]
     return Features(
         invariants=np.stack([depth, np.abs(shear), np.abs(tilt), np.abs(torsion), product.real], axis=1),
         odd=np.stack([torsion, product.imag], axis=1),
         vectors=np.stack([vectors.real, vectors.imag]),
         outputs=(outputs - np.array(spec.output_mean)) / np.array(spec.output_sd),
         scores=scores / spec.component_unit_px,
+        ring_vectors=np.stack([turning.real, turning.imag]),
+        ring_scalars=staying.real,
+        ring_odd=staying.imag,
     )
 
 
@@ -160,20 +213,24 @@ def kernel(block: str, p: Any, a: Features, b: Features, xp: Any = np) -> Any:
 
     Args:
         block: of ``BLOCKS``; the two components of a pair are stacked.
-        p: (12,) logarithms: length and amplitude, and slope, of the outputs and of the components; constant; length,
-            amplitude and constant of the invariant functions; amplitude of those of other vectors; noise.
+        p: (14,) logarithms: length and amplitude, and slope, of the outputs and of the components; constant; length,
+            amplitude and constant of the invariant functions; amplitude of those of other vectors; noise; amplitude and
+            constant of those of the rings.
         a, b: inputs.
         xp: NumPy, or PyTorch where ``p`` is differentiated.
     """
+    ringed = _bell(xp, a.invariants, b.invariants, p[7], p[12]) + xp.exp(2 * p[13])
     plain = _bell(xp, a.outputs, b.outputs, p[0], p[1]) + _slope(xp, a.outputs, b.outputs, p[2])
     plain = plain + _bell(xp, a.scores, b.scores, p[3], p[4]) + _slope(xp, a.scores, b.scores, p[5]) + xp.exp(2 * p[6])
     own = _bell(xp, a.invariants, b.invariants, p[7], p[8]) + xp.exp(2 * p[9])
     other = _bell(xp, a.invariants, b.invariants, p[7], p[10])
     if block == "depth":
-        return plain + own + _slope(xp, a.invariants, b.invariants, p[10])
+        return (
+            plain + own + _slope(xp, a.invariants, b.invariants, p[10]) + ringed * _dot(a.ring_scalars, b.ring_scalars)
+        )
     if block == "torsion":
         torsion, product = (a.odd[:, i, None] * b.odd[None, :, i] for i in (0, 1))
-        return plain + torsion * own + product * other
+        return plain + torsion * own + product * other + ringed * _dot(a.ring_odd, b.ring_odd)
     rows = []
     for i in (0, 1):
         row = []
@@ -182,9 +239,14 @@ def kernel(block: str, p: Any, a: Features, b: Features, xp: Any = np) -> Any:
             for number in range(4):
                 common = own if number == PAIRS.index(block) else other
                 value = value + a.vectors[i, :, number, None] * b.vectors[j, None, :, number] * common
+            value = value + ringed * _dot(a.ring_vectors[i], b.ring_vectors[j])
             row.append(value)
         rows.append(xp.concatenate(row, 1))
     return xp.concatenate(rows, 0)
+
+
+def _dot(a: Any, b: Any) -> Any:
+    return a @ b.T / a.shape[1]
 
 
 def _bell(xp: Any, a: Any, b: Any, length: Any, amplitude: Any) -> Any:
@@ -233,6 +295,9 @@ def _single(at: Features) -> list[Features]:
             at.vectors[:, i : i + 1],
             at.outputs[i : i + 1],
             at.scores[i : i + 1],
+            at.ring_vectors[:, i : i + 1],
+            at.ring_scalars[i : i + 1],
+            at.ring_odd[i : i + 1],
         )
         for i in range(len(at.outputs))
     ]
@@ -263,11 +328,12 @@ class TransferredNetworks:
         self._labels, self._network_labels = header.labels, header.network_labels
         self._layers = layers
         self._reference = reference
+        self._ring_weights = ring_weights(reference)
         self._symmetries = lattice_symmetries(rings_of(len(reference)))
         self._tensors = {
             name: tensor.astype(np.float64) for name, tensor in model.tensors.items() if name.startswith("transfer.")
         }
-        self._learned = features(self._spec, self._tensors["transfer.outputs"], self._tensors["transfer.scores"])
+        self._learned = learned_features(self._spec, self._tensors)
 
     def __call__(self, displacements: NDArray[Any]) -> tuple[Array, Array]:
         """Return means (n, 6) in label half-ranges and standard deviations (n, 6) in units of the labels' sigmas.
@@ -281,7 +347,8 @@ class TransferredNetworks:
             self._layers, fields, self._network_labels, self._symmetries, spec.image_turn, spec.mirror_axes_rad
         )
         scores = (displacements - self._tensors["transfer.mean"]) @ self._tensors["transfer.basis"].T
-        at = features(spec, reflected(outputs) if spec.mirrored else outputs, scores)
+        rings = ring_modes(displacements, self._ring_weights)
+        at = features(spec, reflected(outputs) if spec.mirrored else outputs, scores, rings)
         contacts, process = process_results(spec, self._tensors, at, self._learned)
         variance = combined_variance(spec.network_share, spec.process_share, spec.floor, network, process)
         labels = self._labels

@@ -19,8 +19,12 @@ BLOCKS: Final = ("shear", "tilt", "depth", "torsion")
 PAIRS: Final = ("shear", "tilt")
 """Blocks with two outputs."""
 
-KERNEL: Final = 12
+KERNEL: Final = 14
 """Number of kernel parameters of a block."""
+
+
+BANDS: Final = 5
+"""Bands of rings whose displacements are inputs, where a lattice has so many rings."""
 
 
 class BlockSpec(BaseModel):
@@ -54,6 +58,8 @@ class TransferSpec(BaseModel):
         shear_unit_mm, tilt_unit_deg, torsion_unit_deg, depth_unit_mm: typical magnitudes of the networks' outputs.
         output_mean, output_sd: of the networks' outputs, mm and degrees.
         component_unit_px: typical magnitude of the components.
+        ring_turn_rad: angle from the markers' shift in the image to the networks' shear.
+        ring_units_px: typical magnitudes of ``transfer.ring_modes``, band by band.
         blocks: the Gaussian processes, in the order of ``BLOCKS``.
         network_share, process_share: factors of the networks' and the processes' standard deviations.
         floor: standard deviation in addition, mm and degrees; along and across the shear, then z, alpha, beta, gamma.
@@ -76,6 +82,8 @@ class TransferSpec(BaseModel):
     output_mean: Six
     output_sd: SixPositive
     component_unit_px: Positive
+    ring_turn_rad: Number
+    ring_units_px: tuple[Positive, ...]
     blocks: tuple[BlockSpec, BlockSpec, BlockSpec, BlockSpec]
     network_share: SixNotNegative
     process_share: SixNotNegative
@@ -87,6 +95,7 @@ class TransferSpec(BaseModel):
         shapes: dict[str, tuple[int, ...]] = {
             "transfer.outputs": (n, 6),
             "transfer.scores": (n, k),
+            "transfer.rings": (n, len(self.ring_units_px) // 3, 3, 2),
             "transfer.mean": (2 * m,),
             "transfer.basis": (k, 2 * m),
         }

@@ -21,6 +21,7 @@ from touchcell.perception.models.model_file import Labels
 from touchcell.perception.models.preprocessing import Preprocessing
 
 _SAME_MM_DEG = 1e-6
+_LEAST_MM, _LEAST_DEG = 0.05, 0.8
 
 ProgressCallback = Callable[[int, int], None]
 """Called with the number of items done and the total."""
@@ -108,7 +109,8 @@ def label_range(training: Array, validation: Array) -> Labels:
     """Return labels that span the training set's contacts, given as xi (n, 6), m and rad.
 
     Raises:
-        TrainingError: there are fewer than two labels in either set, they are not finite, or a component never varies.
+        TrainingError: there are fewer than two labels in either set, they are not finite, a component never varies, or
+            all are as small as metres and radians are.
     """
     for name, xi in (("training", training), ("validation", validation)):
         if xi.ndim != 2 or len(xi) < 2 or xi.shape[1] != 6 or not np.isfinite(xi).all():
@@ -120,4 +122,10 @@ def label_range(training: Array, validation: Array) -> Labels:
             raise TrainingError(
                 f"all training labels have the same {name}", hint="collect contacts with varied values of it"
             )
+    largest = np.abs(contacts).max(axis=0)
+    if largest[:3].max() < _LEAST_MM or largest[3:].max() < _LEAST_DEG:
+        raise TrainingError(
+            f"no label is larger than {largest[:3].max():.3g} mm and {largest[3:].max():.3g} degrees",
+            hint="labels are in mm and degrees, not in m or rad",
+        )
     return Labels.of_contacts(tuple(low.tolist()), tuple(high.tolist()))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import tempfile
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -16,14 +17,19 @@ import numpy as np
 
 from touchcell.drivers.core.clock import Clock, MonotonicClock
 from touchcell.drivers.replay.dataset import read_split
-from touchcell.perception.models.prediction import Prediction
+from touchcell.geometry.types import ImageArray
+from touchcell.perception.errors import ImageError
+from touchcell.perception.models.labels import CONTACT_NAMES
+from touchcell.perception.models.prediction import ContactEstimator, Prediction
 from touchcell.perception.networks.dataset import ProgressCallback
-from touchcell.perception.networks.scores import Scores
+from touchcell.perception.networks.scores import SCORE_NAMES, Scores
 from touchcell.perception.runtime.estimators import load_estimator
 
 if TYPE_CHECKING:
     from rich.console import Console
 
+_OUT_OF_RANGE = "beyond the contacts that were taught"
+_FEW_ACCEPTED = 0.95
 _COVERAGE = {"68": 0.68, "95": 0.95}
 
 
@@ -37,6 +43,9 @@ class Evaluation:
         nll: mean negative log-likelihood of xi under the predicted Gaussian, summed over its components, in nats per
             image with xi in mm and degrees.
         latency_ms: ``median`` and ``p99`` of the time from a decoded image to its prediction, on one thread.
+        mae_of_median: of predicting, for each image, the median of the split's own labels.
+        accepted: fraction of the images that show the contact as the model's camera would, within the taught range.
+        refusals: for each reason why images were not accepted, their number.
         coverage: for ``68`` and ``95`` percent, the fraction of labels of each component of xi that lie in the central
             interval of the predicted Gaussian; the components of xi are the contact's, seen from the surface's side.
     """
@@ -45,6 +54,9 @@ class Evaluation:
     mae: dict[str, float]
     nll: float
     latency_ms: dict[str, float]
+    mae_of_median: dict[str, float]
+    accepted: float
+    refusals: dict[str, int]
     coverage: dict[str, dict[str, float]]
 
     def to_json(self) -> str:
@@ -72,6 +84,8 @@ def evaluate(
 ) -> Evaluation:
     """Predict every image of a split one by one, as at run time, and compare with the labels.
 
+    Errors are of all images, accepted or not.
+
     Args:
         data: data set, see ``touchcell.drivers.replay.dataset``.
         split: train, val or test.
@@ -97,13 +111,15 @@ def evaluate(
     with one_opencv_thread():
         for i, image in enumerate(labelled.read()):
             if i == 0:
-                contact_model.predict(image)  # The first run also allocates memory.
+                _first(contact_model, image)
             start_ns = clock.now_ns()
             predictions.append(contact_model.predict(image))
             latencies_ns[i] = clock.now_ns() - start_ns
             if progress is not None:
                 progress(i + 1, n)
     scores = Scores.of(labelled.contact_mm_deg, predictions)
+    median = np.abs(labelled.contact_mm_deg - np.median(labelled.contact_mm_deg, axis=0)).mean(axis=0)
+    refusals = Counter(each.refusal or _OUT_OF_RANGE for each in predictions if not each.in_range)
     return Evaluation(
         n=n,
         mae=scores.mae(),
@@ -112,8 +128,20 @@ def evaluate(
             "median": float(np.median(latencies_ns)) * 1e-6,
             "p99": float(np.percentile(latencies_ns, 99)) * 1e-6,
         },
+        mae_of_median={name: float(median[CONTACT_NAMES.index(name)]) for name in SCORE_NAMES},
+        accepted=float(scores.in_range.mean()),
+        refusals=dict(refusals.most_common()),
         coverage={percent: scores.coverage(share) for percent, share in _COVERAGE.items()},
     )
+
+
+def _first(estimator: ContactEstimator, image: ImageArray) -> None:
+    """Predict once, as the first run also allocates memory."""
+    try:
+        estimator.predict(image)
+    except ImageError as error:
+        hint = "the model is for another camera or crop; `touchcell adapt` brings a marker model to another sensor"
+        raise ImageError(error.attribute, error.expected, error.found, hint=hint) from error
 
 
 def print_table(evaluation: Evaluation, console: Console | None = None) -> None:
@@ -126,6 +154,7 @@ def print_table(evaluation: Evaluation, console: Console | None = None) -> None:
     for name in evaluation.mae:
         table.add_column(name, justify="right")
     table.add_row("MAE", *(f"{error:.3f}" for error in evaluation.mae.values()))
+    table.add_row("MAE of the median label", *(f"{error:.3f}" for error in evaluation.mae_of_median.values()))
     for percent, fractions in evaluation.coverage.items():
         table.add_row(f"within {percent} %", *(f"{100.0 * fractions[name]:.1f} %" for name in evaluation.mae))
     console = console or Console()
@@ -136,6 +165,23 @@ def print_table(evaluation: Evaluation, console: Console | None = None) -> None:
         f"{latency['median']:.2f} ms per image (median), {latency['p99']:.2f} ms (99 %)",
         soft_wrap=True,
     )
+    console.print(f"{100.0 * evaluation.accepted:.1f} % of the images accepted", soft_wrap=True)
+    for line in warnings_of(evaluation):
+        console.print(f"warning: {line}", soft_wrap=True, highlight=False, markup=False)
+
+
+def warnings_of(evaluation: Evaluation) -> list[str]:
+    """Return what speaks against using this model with this sensor, a sentence each."""
+    found = []
+    if evaluation.accepted < _FEW_ACCEPTED:
+        found = [f"{count} images not accepted: {reason}" for reason, count in evaluation.refusals.items()]
+    useless = [name for name, error in evaluation.mae.items() if error >= evaluation.mae_of_median[name]]
+    if useless:
+        found.append(
+            f"{', '.join(useless)}: no better than the median of the labels; is it another sensor, or are its labels "
+            "about other axes? `touchcell adapt` finds the convention"
+        )
+    return found
 
 
 @contextmanager

@@ -9,9 +9,10 @@ import math
 import os
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
@@ -23,7 +24,7 @@ from torch import Tensor
 
 from touchcell.drivers.replay.dataset import Split, read_rest, read_split
 from touchcell.geometry.types import Array, ImageArray
-from touchcell.perception.errors import TrainingError
+from touchcell.perception.errors import ImageError, TrainingError
 from touchcell.perception.markers.camera_check import learn_check
 from touchcell.perception.markers.detection import Discs, detect_markers, rings_of, typical_size
 from touchcell.perception.markers.figures import write_markers
@@ -64,6 +65,7 @@ from touchcell.perception.networks.progress import Display, Observer
 
 _LEAST_SCORE_TAUGHT = 0.9
 _LEAST_BATCHES = 16
+_LOOKED_AT = 20
 _MATCHING = 2  # Version of the matching, so that results of older versions are not taken from the cache.
 
 
@@ -148,6 +150,22 @@ def preprocessing_for(image: ImageArray) -> Preprocessing:
     )
 
 
+def preprocessing_and_size(images: Iterable[ImageArray]) -> tuple[Preprocessing, MarkerSize]:
+    """Return preprocessing and size of markers of a data set's images, from the first that shows markers.
+
+    Raises:
+        ImageError: the first twenty images show none.
+    """
+    error: ImageError | None = None
+    for image in islice(images, _LOOKED_AT):
+        preprocessing = preprocessing_for(image)
+        try:
+            return preprocessing, typical_size(preprocessing.reduce(image))
+        except ImageError as found:
+            error = error or found
+    raise error or ImageError("content", "7 markers or more", 0)
+
+
 def train_markers(
     data: Path,
     out: Path,
@@ -171,9 +189,8 @@ def train_markers(
         with Display() as display:
             return train_markers(data, out, settings=settings, resume=resume, cache=cache, observer=display)
     splits = {name: read_split(data, name) for name in ("train", "val")}
-    preprocessing = preprocessing_for(next(splits["train"].read()))
+    preprocessing, size = preprocessing_and_size(splits["train"].read())
     cache = cache or default_cache()
-    size = typical_size(preprocessing.reduce(next(splits["train"].read())))
     report = observer.images
     sets = {
         name: LabelledDiscs(
