@@ -41,7 +41,7 @@ def run_into_the_wall(folder: Path, **arm: Any) -> Path:
 def test_the_ring_keeps_ten_seconds() -> None:
     with BlackBox() as box:
         for k in range(3000):
-            box.add("/task", k * 10_000_000, ENCODER.encode("/task", {"k": k}))
+            box.add([("/task", k * 10_000_000, ENCODER.encode("/task", {"k": k}))])
         # Both ends included.
         assert [message.data["k"] for message in box.messages()] == list(range(1999, 3000))
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import logging
+import re
 import struct
 import zlib
 from collections.abc import Callable, Iterator
@@ -49,7 +50,8 @@ _LONGEST_CHUNK: Final = 1 << 26
 _MOST_EXPANSION: Final = 50
 _USUAL_CHUNK: Final = 1 << 20
 # A chunk's compression, as a prefixed string, and how far it is behind the chunk's first byte.
-_CHUNK_MARK: Final = b"\x03\x00\x00\x00lz4"
+_CHUNK_MARK: Final = re.compile(rb"\x03\x00\x00\x00lz4|\x04\x00\x00\x00zstd")
+_LONGEST_MARK: Final = 8
 _CHUNK_MARK_AT: Final = _RECORD_HEAD + 8 + 8 + 8 + 4
 
 
@@ -297,13 +299,12 @@ class _Reader:
         at = offset
         while block := self._stream.read(_BLOCK_BYTES):
             held = overlap + block
-            place = -1
-            while (place := held.find(_CHUNK_MARK, place + 1)) >= 0:
-                start = at - len(overlap) + place - _CHUNK_MARK_AT
+            for mark in _CHUNK_MARK.finditer(held):
+                start = at - len(overlap) + mark.start() - _CHUNK_MARK_AT
                 if start >= offset and self._is_kind(start, Opcode.CHUNK):
                     return start
             at += len(block)
-            overlap = held[-len(_CHUNK_MARK) :]
+            overlap = held[1 - _LONGEST_MARK :]
             self._stream.seek(at)
         return None
 
