@@ -29,6 +29,7 @@ BENCHMARKS = {
     "mutation": "benchmarks.mutation",
     "hil-mutation": "benchmarks.hil_mutation",
     "phantom": "benchmarks.phantom",
+    "pictures": "benchmarks.pictures",
     "pushes": "benchmarks.pushes",
     "recipe": "benchmarks.recipe",
     "recording": "benchmarks.recording",

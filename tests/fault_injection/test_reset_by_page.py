@@ -37,7 +37,13 @@ from touchcell.tasks.state_machine_task import MachineTask
 TRIPS = {"nan_state": ArmFaults(nan_state=True), "stale": ArmFaults(stale=True)}
 """Faults that trip in every state and can pass."""
 UNREACHED = {"check": "nothing is checked on the true contact", "return": "no contact is lost there"}
+AFTER_STOP = frozenset({"withdraw"})
+"""States that come after an operator's stop: a trip ends the run there, and nothing is left to resume."""
+_STOPPED_AFTER_S = 0.8
 _SETTLED_CYCLES = 5
+_WATCHED_CYCLES = 20
+_FEW_CYCLES = 2
+"""Where the surface moves on: an arm that stands would soon be pressed against it, and trip again."""
 _LONGEST_CYCLES = 4000
 _DEADLINE_S = 60.0
 TASKS = {name: on_true_contact(data) for name, data in cells().items() if data.get("interlocks") and name != "observe"}
@@ -142,16 +148,31 @@ def states(task: str, folder: Path) -> list[str]:
 def reset_moves_nothing(run: OperatedByPage, state: str, faults: ArmFaults) -> None:
     """Trip in a state, and go through every answer that an operator can give."""
     latch = run.cell.supervisor.latch
+    ends = state in AFTER_STOP
+    if ends:
+        run.until(lambda: run.cell.clock.now_ns() > run.cell.start_ns + _STOPPED_AFTER_S * 1e9)
+        run.stop.ask()
     run.until(lambda: run.cell.task.state == state)
     for _ in range(_SETTLED_CYCLES):
         if run.cell.task.state == state:
             run.loop.step()
     run.fault(faults)
+    if ends:
+        while run.loop.step():
+            pass
+        stood, run.told[:] = run.poses(), []
+        assert "no answer" in run.press(OperatorRequest.RESET, confirmed=True)
+        assert "no answer" in run.press(OperatorRequest.RESUME, confirmed=True)
+        assert run.told == run.wrong == []
+        assert np.array_equal(run.poses(), stood)
+        return
     run.until(lambda: run.loop.state is RunState.WAITING_FOR_RESET)
     stood, run.told[:] = run.poses(), []
 
-    def nothing_moved(cycles: int = 20) -> None:
-        for _ in range(cycles):
+    watched = _FEW_CYCLES if run.cell.task_name == "object_tracking" else _WATCHED_CYCLES
+
+    def nothing_moved(times: int = 1) -> None:
+        for _ in range(times * watched):
             assert run.loop.step()
         assert run.loop.state is RunState.WAITING_FOR_RESET
         assert run.told == run.wrong == []
@@ -172,7 +193,7 @@ def reset_moves_nothing(run: OperatedByPage, state: str, faults: ArmFaults) -> N
         reply = run.press(OperatorRequest.RESET, confirmed=True)
     assert reply == "reset; nothing moves until `touchcell resume`"
     assert latch.state is LatchState.CLEAR
-    nothing_moved(100)
+    nothing_moved(5)
     assert run.press(OperatorRequest.RESET, confirmed=True).startswith("refused")
     nothing_moved()
     assert run.press(OperatorRequest.RESUME, confirmed=False) == ""

@@ -87,8 +87,11 @@ def read(path: Path, damage: list[Damage] | None = None) -> Iterator[Message]:
     """
     found: list[Damage] = [] if damage is None else damage
     with _opened(path) as stream:
-        if stream.read(len(_MAGIC)) != _MAGIC:
-            raise RecordingError(path, "is not an MCAP file")
+        if (magic := stream.read(len(_MAGIC))) != _MAGIC:
+            empty = _MAGIC.startswith(magic)
+            raise RecordingError(
+                path, "is empty: its writer ended before anything was written" if empty else "is not an MCAP file"
+            )
         yield from _Reader(stream, lambda: False, found).messages()
     if damage is None:
         for each in found:
@@ -123,6 +126,19 @@ def _opened(path: Path) -> IO[bytes]:
         return path.open("rb")
     except OSError as error:
         raise RecordingError(path, f"cannot be read: {error.strerror}") from None
+
+
+def wall_clock_offset_ns(path: Path) -> int:
+    """Return wall clock minus the cell's clock of a recording, whole or not; 0 where nothing says it.
+
+    Raises:
+        RecordingError: ``path`` cannot be read.
+    """
+    with _opened(path) as stream:
+        stream.seek(len(_MAGIC))
+        reader = _Reader(stream, lambda: False, [])
+        next(reader.messages(), None)
+        return next((channel.offset_ns for channel in reader.channels), 0)
 
 
 class _Damaged(Exception):
@@ -162,6 +178,11 @@ class _Reader:
         self._searched = False
         self._delivered = 0
         self._promised: int | None = None
+
+    @property
+    def channels(self) -> list[_Channel]:
+        """The channels that were described so far."""
+        return list(self._channels.values())
 
     def bytes_at(self, offset: int, count: int) -> bytes | None:
         """``count`` bytes at ``offset``; None if the file ends before and nothing more comes."""
