@@ -87,10 +87,7 @@ def _ui_jog(browser: Any, folder: Path, picture: Path) -> None:
         box = page.locator("[data-jog='x+']").bounding_box()
         page.mouse.move(box["x"] + 8, box["y"] + 8)
         page.mouse.down()
-        page.wait_for_function(
-            "(text => text && !text.startsWith('idle') && text.includes('x -7'))"
-            "(document.querySelector('.text-mono')?.innerText)"
-        )
+        page.wait_for_function("document.querySelector('.text-mono')?.innerText.includes('x -7')")
         _take(page, picture, settles_s=0.0)
 
 

@@ -26,7 +26,6 @@ from touchcell.cell.runtime.operator_input import reachable, stop_on_signals
 from touchcell.cell.runtime.run_result import Outcome
 from touchcell.cell.runtime.run_states import RunState
 from touchcell.cell.runtime.stop_request import StopRequest
-from touchcell.cell.ui import page
 from touchcell.cell.ui.runs import Runs
 from touchcell.control.latch import LatchState
 from touchcell.geometry.types import Array
@@ -34,11 +33,12 @@ from touchcell.simulation.devices.arm import SimArm
 from touchcell.simulation.faults import ArmFaults
 from touchcell.tasks.state_machine_task import MachineTask
 
+page: Any = pytest.importorskip("touchcell.cell.ui.page", reason="pip install 'touchcell[ui]'")
 TRIPS = {"nan_state": ArmFaults(nan_state=True), "stale": ArmFaults(stale=True)}
 """Faults that trip in every state and can pass."""
 UNREACHED = {"check": "nothing is checked on the true contact", "return": "no contact is lost there"}
-AFTER_STOP = frozenset({"withdraw"})
-"""States that come after an operator's stop: a trip ends the run there, and nothing is left to resume."""
+AFTER_STOP = frozenset({"withdraw, steps", "retract, data_collection"})
+"""States that last only after an operator's stop: a trip ends the run there, and nothing is left to resume."""
 _STOPPED_AFTER_S = 0.8
 _SETTLED_CYCLES = 5
 _WATCHED_CYCLES = 20
@@ -145,11 +145,18 @@ def states(task: str, folder: Path) -> list[str]:
     return [state for state in probe.states if state not in UNREACHED]
 
 
+def run_state(run: OperatedByPage) -> RunState:
+    return run.loop.state
+
+
+def latch_state(run: OperatedByPage) -> LatchState:
+    return run.cell.supervisor.latch.state
+
+
 def reset_moves_nothing(run: OperatedByPage, state: str, faults: ArmFaults) -> None:
     """Trip in a state, and go through every answer that an operator can give."""
-    latch = run.cell.supervisor.latch
-    ends = state in AFTER_STOP
-    if ends:
+    after_stop = f"{state}, {run.cell.task_name}" in AFTER_STOP
+    if after_stop:
         run.until(lambda: run.cell.clock.now_ns() > run.cell.start_ns + _STOPPED_AFTER_S * 1e9)
         run.stop.ask()
     run.until(lambda: run.cell.task.state == state)
@@ -157,7 +164,7 @@ def reset_moves_nothing(run: OperatedByPage, state: str, faults: ArmFaults) -> N
         if run.cell.task.state == state:
             run.loop.step()
     run.fault(faults)
-    if ends:
+    if after_stop:
         while run.loop.step():
             pass
         stood, run.told[:] = run.poses(), []
@@ -174,7 +181,7 @@ def reset_moves_nothing(run: OperatedByPage, state: str, faults: ArmFaults) -> N
     def nothing_moved(times: int = 1) -> None:
         for _ in range(times * watched):
             assert run.loop.step()
-        assert run.loop.state is RunState.WAITING_FOR_RESET
+        assert run_state(run) is RunState.WAITING_FOR_RESET
         assert run.told == run.wrong == []
         assert np.abs(np.array(run.poses()) - np.array(stood)).max() < 1e-12
 
@@ -185,21 +192,21 @@ def reset_moves_nothing(run: OperatedByPage, state: str, faults: ArmFaults) -> N
     assert "refused: reset first" in run.press(OperatorRequest.RESUME, confirmed=True)
     nothing_moved()
     assert run.press(OperatorRequest.RESET, confirmed=False) == ""
-    assert latch.state is LatchState.CAUSE_GONE
+    assert latch_state(run) is LatchState.CAUSE_GONE
     nothing_moved()
     reply = run.press(OperatorRequest.RESET, confirmed=True)
     if "ask again" in reply:
         nothing_moved()
         reply = run.press(OperatorRequest.RESET, confirmed=True)
     assert reply == "reset; nothing moves until `touchcell resume`"
-    assert latch.state is LatchState.CLEAR
+    assert latch_state(run) is LatchState.CLEAR
     nothing_moved(5)
     assert run.press(OperatorRequest.RESET, confirmed=True).startswith("refused")
     nothing_moved()
     assert run.press(OperatorRequest.RESUME, confirmed=False) == ""
     nothing_moved()
     assert run.press(OperatorRequest.RESUME, confirmed=True) == "the task starts again from its first state"
-    assert run.loop.state is RunState.RUNNING
+    assert run_state(run) is RunState.RUNNING
     assert run.wrong == []
 
 
