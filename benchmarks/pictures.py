@@ -61,7 +61,7 @@ def _ui_run(browser: Any, folder: Path, picture: Path) -> None:
     with _served(folder, "ui", "--port", "0") as address:
         page = _page(browser, address.replace("/?", "/run/dual_push?"), _TALL)
         slider = page.locator(".q-slider").first
-        slider.wait_for()
+        _until(lambda: slider.bounding_box() is not None)
         slider.click(position={"x": 0.62 * slider.bounding_box()["width"], "y": 10})
         page.locator("svg .present").first.wait_for(state="attached")
         page.locator("img").first.wait_for()
