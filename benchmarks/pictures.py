@@ -63,6 +63,7 @@ def _ui_run(browser: Any, folder: Path, picture: Path) -> None:
         slider = page.locator(".q-slider").first
         _until(lambda: slider.bounding_box() is not None)
         slider.click(position={"x": 0.62 * slider.bounding_box()["width"], "y": 10})
+        page.wait_for_function("document.querySelector('.q-badge').innerText.startsWith('run')")
         page.locator("svg .present").first.wait_for(state="attached")
         page.locator("img").first.wait_for()
         _take(page, picture)
@@ -93,9 +94,11 @@ def _ui_jog(browser: Any, folder: Path, picture: Path) -> None:
 
 def _rerun(browser: Any, folder: Path, picture: Path) -> None:
     _touchcell(folder, "run", "dual_push_sim.yaml", "--quiet", "--out", "dual_push", "--set", "recording.frames=jpeg")
+    import rerun_cli
+
     _touchcell(folder, "open", "dual_push", "--rerun", "--to", "run.rrd")
     page_port, data_port = _free_port(), _free_port()
-    command = [shutil.which("rerun", path=str(Path(sys.executable).parent)) or "rerun", "run.rrd", "--web-viewer"]
+    command = [str(Path(rerun_cli.__file__).with_name("rerun")), "run.rrd", "--web-viewer"]
     command += ["--web-viewer-port", str(page_port), "--port", str(data_port)]
     with subprocess.Popen(command, cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as viewer:
         try:
@@ -170,7 +173,7 @@ def _page(browser: Any, address: str, size: dict[str, int]) -> Any:
     return page
 
 
-def _take(page: Any, picture: Path, *, settles_s: float = 4.0) -> None:
+def _take(page: Any, picture: Path, *, settles_s: float = 15.0) -> None:
     time.sleep(settles_s)
     page.screenshot(path=str(picture))
     page.close()
