@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 from touchcell import compiled
 from touchcell.cell.analysis.limits import close_calls
 from touchcell.cell.analysis.run_data import STAGES, Run, Series
-from touchcell.cell.analysis.run_folder import RESULT, RunFolder
+from touchcell.cell.analysis.run_folder import RunFolder
 from touchcell.cell.config.cell_plan import CellPlan
 from touchcell.cell.recording.mcap import RECORDING
 from touchcell.cell.recording.messages import COMPONENTS
 from touchcell.cell.runtime.operator_input import is_running
+from touchcell.cell.runtime.result_record import RESULT
 from touchcell.cell.scene.description import SceneDescription, describe_scene
 from touchcell.errors import ConfigError, TouchcellError
 from touchcell.geometry.types import Array

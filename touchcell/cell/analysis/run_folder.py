@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 from touchcell.cell.analysis.run_data import Run, Series, load_run, tip_points
 from touchcell.cell.config.cell_plan import CellPlan
 from touchcell.cell.config.schema import plan_cell
+from touchcell.cell.runtime.result_record import RESULT
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
-
-RESULT: Final = "result.json"
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ import numpy as np
 
 from touchcell.cell.analysis.limits import WatchedQuantity, tripped_quantity
 from touchcell.cell.analysis.run_data import Run, Series, load_run, run_of
-from touchcell.cell.analysis.run_folder import RESULT, RunFolder
+from touchcell.cell.analysis.run_folder import RunFolder
 from touchcell.cell.config.yaml_file import load
 from touchcell.cell.errors import RecordingError
 from touchcell.cell.recording.mcap import RECORDING
