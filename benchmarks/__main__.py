@@ -30,6 +30,7 @@ BENCHMARKS = {
     "hil-mutation": "benchmarks.hil_mutation",
     "hil-suites": "benchmarks.hil_suites",
     "phantom": "benchmarks.phantom",
+    "pictures": "benchmarks.pictures",
     "pushes": "benchmarks.pushes",
     "recipe": "benchmarks.recipe",
     "recording": "benchmarks.recording",

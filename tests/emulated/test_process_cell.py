@@ -10,7 +10,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -377,8 +377,8 @@ class Topics:
     def __init__(self) -> None:
         self.told: set[str] = set()
 
-    def add(self, topic: str, t_ns: int, message: Encoded) -> None:
-        self.told.add(topic)
+    def add(self, messages: Sequence[tuple[str, int, Encoded]]) -> None:
+        self.told.update(topic for topic, _, _ in messages)
 
 
 def test_the_ground_truth_of_a_scene_in_a_host_is_published_and_recorded(tmp_path: Path) -> None:

@@ -276,3 +276,38 @@ def test_a_hundred_reloads_and_vanishing_tabs_leave_no_traceback(browser: Any, t
     text = jog.log.read_text()
     assert "Traceback" not in text
     assert "rror" not in text
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize("name", sorted(path.name for path in CONFIGS.glob("*.yaml")))
+def test_every_shipped_cell_is_shown_at_the_width_of_a_phone_and_of_a_desk(
+    browser: Any, tmp_path: Path, name: str
+) -> None:
+    if name.startswith("replay_real"):
+        pytest.skip("replays a data set that is not here")
+    out = tmp_path / "runs" / "shown"
+    command = [sys.executable, "-m", "touchcell", "run", name, "--on", "sim", "--quiet", "--out", str(out)]
+    command += ["--set", "max_duration_s=1.5", "--set", "recording.frames=jpeg"]
+    done = subprocess.run(command, cwd=tmp_path, env=ENVIRONMENT, capture_output=True, text=True, check=False)
+    assert (out / "run.mcap").stat().st_size > 10_000, done.stderr
+    interlocks = yaml.safe_load((out / "cell.yaml").read_text())["interlocks"]
+    server = Process(tmp_path, "ui", "runs/shown", "--port", "0")
+    try:
+        address = server.address()
+        for width in (390, 1280):
+            page = browser.new_page(viewport={"width": width, "height": 900})
+            page.set_default_timeout(1e3 * DEADLINE_S)
+            errors: list[str] = []
+            page.on("pageerror", lambda error, errors=errors: errors.append(str(error)))
+            page.goto(address, wait_until="domcontentloaded")
+            page.get_by_text(re.compile(r"\d s · ")).first.wait_for()
+            page.locator("svg .present").first.wait_for(state="attached")
+            for interlock in interlocks:
+                page.get_by_text(re.compile(rf"^{interlock}\b")).first.wait_for()
+            assert page.evaluate("document.documentElement.scrollWidth") <= width
+            assert errors == []
+            page.close()
+    finally:
+        server.end()
+    assert "Traceback" not in server.log.read_text()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from touchcell.cell.recording.message_types import Encoded
 from touchcell.cell.runtime.run_record import Box
 
@@ -17,12 +19,13 @@ class SentCommands:
         self._box = box
         self._last_ns: int | None = None
 
-    def add(self, topic: str, t_ns: int, message: Encoded) -> None:
-        """Take in one message."""
-        if topic.endswith("/command"):
-            self._last_ns = t_ns
+    def add(self, messages: Sequence[tuple[str, int, Encoded]]) -> None:
+        """Take in messages."""
+        for topic, t_ns, _ in messages:
+            if topic.endswith("/command"):
+                self._last_ns = t_ns
         if self._box is not None:
-            self._box.add(topic, t_ns, message)
+            self._box.add(messages)
 
     def since(self, t_ns: int) -> bool:
         """Return True if a command was sent at ``t_ns`` or later."""

@@ -1,6 +1,6 @@
 """``python -m tests.helpers.dying_run MESSAGES SIGNAL CELL OUT``: a run that is ended by a signal of its own.
 
-The signal comes while the black box takes its message number MESSAGES, so that no clock decides when.
+The signal comes once the black box has taken MESSAGES messages, so that no clock decides when.
 """
 
 from __future__ import annotations
@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+from collections.abc import Sequence
 
 from touchcell.cell.cli.main import main
 from touchcell.cell.recording.message_types import Encoded
@@ -19,11 +20,11 @@ def run(messages: int, number: signal.Signals, cell: str, out: str) -> int:
     add = BlackBox.add
     count = 0
 
-    def add_and_die(box: BlackBox, topic: str, t_ns: int, message: Encoded) -> None:
+    def add_and_die(box: BlackBox, added: Sequence[tuple[str, int, Encoded]]) -> None:
         nonlocal count
-        add(box, topic, t_ns, message)
-        count += 1
-        if count == messages:
+        add(box, added)
+        count += len(added)
+        if count >= messages:
             os.kill(os.getpid(), number)
 
     BlackBox.add = add_and_die  # type: ignore[assignment, method-assign]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from os import PathLike
@@ -13,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from touchcell.cell.analysis.run_data import Series, load_run
+from touchcell.cell.analysis.run_folder import RunFolder
 from touchcell.cell.recording.mcap import RECORDING
 from touchcell.errors import suggest
 from touchcell.geometry.types import Array
@@ -98,12 +98,11 @@ def read_run(folder: str | PathLike[str]) -> RunRecording:
     """
     path = Path(folder)
     run = load_run(path / RECORDING)
-    result_file = path / "result.json"
     return RunRecording(
         path,
         {name: _topic(name, series) for name, series in sorted(run.topics.items())},
         tuple({"t_s": (event.t_ns - run.start_ns) * 1e-9, **event.data} for event in run.events),
-        json.loads(result_file.read_text()) if result_file.exists() else {},
+        RunFolder(path).result,
     )
 
 

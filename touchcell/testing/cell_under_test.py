@@ -133,9 +133,9 @@ class CellUnderTest:
     def __repr__(self) -> str:
         return f"<CellUnderTest {self.plan.cell.name!r}: {self.state} after {self.t_s:.3f} s>"
 
-    def add(self, topic: str, t_ns: int, message: Encoded) -> None:
-        """Keep one message; called by the run loop."""
-        self.messages.append(Message(topic, t_ns, message))
+    def add(self, messages: Sequence[tuple[str, int, Encoded]]) -> None:
+        """Keep topics, stamps and messages; called by the run loop."""
+        self.messages += [Message(*message) for message in messages]
 
     # What is the case.
 

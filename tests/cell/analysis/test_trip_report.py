@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 import yaml
 
+from touchcell.cell.analysis.trip_report import REMEDIES
 from touchcell.cell.cli.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_TRIPPED
 from touchcell.cell.cli.main import main
 from touchcell.cell.config.true_contact import put_on_true_contact
@@ -17,6 +18,7 @@ from touchcell.cell.recording.mcap import read
 from touchcell.cell.recording.message_types import Encoder
 from touchcell.cell.recording.messages import declared_type
 from touchcell.cell.runtime.black_box import BlackBox
+from touchcell.control.interlocks.spec import INTERLOCKS
 from touchcell.paths import CONFIGS
 from touchcell.simulation.devices.arm import SimArm
 from touchcell.simulation.faults import ArmFaults
@@ -41,7 +43,7 @@ def run_into_the_wall(folder: Path, **arm: Any) -> Path:
 def test_the_ring_keeps_ten_seconds() -> None:
     with BlackBox() as box:
         for k in range(3000):
-            box.add("/task", k * 10_000_000, ENCODER.encode("/task", {"k": k}))
+            box.add([("/task", k * 10_000_000, ENCODER.encode("/task", {"k": k}))])
         # Both ends included.
         assert [message.data["k"] for message in box.messages()] == list(range(1999, 3000))
 
@@ -133,3 +135,7 @@ def test_limited_tells_what_to_do(tmp_path: Path, capsys: pytest.CaptureFixture[
     told = capsys.readouterr().out
     assert "limited (trip): arm: limited by its gate" in told
     assert "what to do: lower the task's gains" in told
+
+
+def test_every_kind_of_interlock_has_a_remedy() -> None:
+    assert set(REMEDIES) == {*INTERLOCKS.names(), "finite", "missing"}

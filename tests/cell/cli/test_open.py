@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import shutil
 from pathlib import Path
 
 import pytest
+from mcap.reader import make_reader
 
 from touchcell.cell.cli.main import main
+from touchcell.cell.recording.mcap import RECORDING, read, wall_clock_offset_ns
+from touchcell.cell.recording.salvage import whole
 
 
 @pytest.fixture(scope="module")
@@ -41,6 +45,27 @@ def test_a_run_is_written_for_rerun_with_what_rerun_does_not_draw_itself(folder:
     target = tmp_path / "run.rrd"
     assert main(["open", str(folder), "--rerun", "--to", str(target)]) == 0
     assert target.stat().st_size > 10_000
+
+
+@pytest.mark.parametrize("kept", [0.05, 0.5, 0.999])
+def test_a_run_that_was_cut_off_is_written_for_rerun_up_to_the_cut(folder: Path, tmp_path: Path, kept: float) -> None:
+    pytest.importorskip("rerun", reason="pip install 'touchcell[rerun]'")
+    cut = tmp_path / "cut"
+    shutil.copytree(folder, cut)
+    content = (cut / RECORDING).read_bytes()
+    (cut / RECORDING).write_bytes(content[: int(kept * len(content))])
+    with whole(cut / RECORDING) as readable:
+        assert list(read(readable)) == list(read(cut / RECORDING))
+        with readable.open("rb") as stream:
+            assert make_reader(stream).get_summary() is not None
+    assert main(["open", str(cut), "--rerun", "--to", str(tmp_path / "run.rrd")]) == 0
+    assert (tmp_path / "run.rrd").stat().st_size > 10_000
+
+
+def test_a_run_that_is_whole_is_not_written_anew(folder: Path) -> None:
+    with whole(folder / RECORDING) as readable:
+        assert readable == folder / RECORDING
+    assert wall_clock_offset_ns(folder / RECORDING) > 1e18
 
 
 def test_reruns_viewer_need_not_be_in_path_and_its_failure_is_one_message(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -12,6 +13,7 @@ from typing import IO, Any
 import pytest
 import yaml
 
+import touchcell as tc
 from tests.helpers.pushing_cell import cell_file
 from touchcell.cell.cli.exit_codes import EXIT_BAD_INPUT, EXIT_DEVICE_LOST, EXIT_OK, EXIT_TASK_FAILED, EXIT_TRIPPED
 from touchcell.cell.cli.main import main
@@ -107,3 +109,60 @@ def test_the_exit_code_is_the_same_whatever_becomes_of_the_output(tmp_path: Path
             os.close(writing)
     assert code == (EXIT_TRIPPED if limit_mm == 0.01 else EXIT_OK)
     assert result_of(folder)["outcome"] == ("tripped" if limit_mm == 0.01 else "done")
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("finished") / "run"
+    words = ["--set", "task.distance_mm=2", "--set", "task.retract_mm=3", "--quiet", "--out", str(folder)]
+    assert main(["run", str(cell(folder.parent)), *words]) == 0
+    return folder
+
+
+@pytest.mark.parametrize("left", ["", "{", "[]", "null", '{"outcome": "done"}', "\x00"])
+def test_a_result_that_is_missing_or_damaged_is_said_first_and_the_recording_is_reported(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], left: str
+) -> None:
+    folder = tmp_path / "run"
+    shutil.copytree(finished, folder)
+    (folder / "result.json").unlink()
+    if left:
+        (folder / "result.json").write_text(left)
+    assert main(["report", str(folder)]) == 0
+    first, *rest = capsys.readouterr().out.splitlines()
+    assert "surface_following has no result after" in first
+    assert ("result.json is damaged" if left else "it was killed, crashed") in first
+    assert any("closest:" in line for line in rest)
+    assert main(["why", str(folder)]) == 0
+    assert "arm: moved" in capsys.readouterr().out
+    assert tc.read_run(folder)["/arms/arm/tcp"].t_s.size > 100
+
+
+def test_a_recording_that_is_cut_off_says_so_before_its_numbers(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "run"
+    shutil.copytree(finished, folder)
+    content = (folder / "run.mcap").read_bytes()
+    (folder / "run.mcap").write_bytes(content[: 2 * len(content) // 3])
+    assert main(["report", str(folder)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert "done after" in lines[0]
+    assert "recorded until" in lines[1]
+    assert "damaged in 1 place, first at byte" in lines[1]
+
+
+def test_a_black_box_without_its_description_leaves_the_answer_to_the_recording(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "run"
+    shutil.copytree(finished, folder)
+    (folder / "blackbox.json").write_text('{"outcome": ')
+    assert main(["why", str(folder)]) == 0
+    assert "evidence: run.mcap" in capsys.readouterr().out
+
+
+def test_a_recording_to_which_nothing_was_written_is_empty(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "run.mcap").write_bytes(b"")
+    assert main(["report", str(tmp_path)]) == 2
+    assert "is empty: its writer ended before anything was written" in capsys.readouterr().err

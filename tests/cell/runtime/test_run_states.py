@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -141,7 +141,7 @@ class Watched:
         self.run.arm._body.follow = followed  # type: ignore[method-assign]
         self.run.arm.stop = stopped  # type: ignore[method-assign]
 
-    def add(self, topic: str, t_ns: int, message: Encoded) -> None:
+    def add(self, messages: Sequence[tuple[str, int, Encoded]]) -> None:
         if self.state() is STOPPING and self.while_stopping is not None:
             stimulus, self.while_stopping = self.while_stopping, None
             stimulus()

@@ -160,7 +160,7 @@ def test_the_ring_of_a_run_that_was_killed_is_shown(runs: Path, tmp_path: Path) 
     encoder = Encoder(declared_type)
     with BlackBox(tmp_path, {}) as box:
         for t_ns, state in ((0, "approach"), (10**9, "run")):
-            box.add("/task", t_ns, encoder.encode("/task", {"state": state}))
+            box.add([("/task", t_ns, encoder.encode("/task", {"state": state}))])
     assert sources(tmp_path) == ["blackbox.ring"]
     view = RunView(tmp_path, "blackbox.ring")
     view.read()

@@ -17,6 +17,8 @@ from touchcell.cell.analysis.run_folder import RunFolder
 from touchcell.cell.config.cell_plan import CellPlan
 from touchcell.cell.recording.mcap import RECORDING
 from touchcell.cell.recording.messages import COMPONENTS
+from touchcell.cell.runtime.operator_input import is_running
+from touchcell.cell.runtime.result_record import RESULT
 from touchcell.cell.scene.description import SceneDescription, describe_scene
 from touchcell.errors import ConfigError, TouchcellError
 from touchcell.geometry.types import Array
@@ -30,14 +32,13 @@ def write_report(folder: Path) -> str:
     """
     source = RunFolder(folder)
     run = source.recording
-    result_file = folder / "result.json"
-    result = json.loads(result_file.read_text()) if result_file.exists() else {}
+    result = source.result
     plan = _plan(source)
     calls = {} if plan is None else {"close_calls": close_calls(run, plan)}
     truth = {"truth": dict(plan.truth)} if plan is not None and plan.truth else {}
     summary = {**_push_errors(source), **calls, **truth, **summarise(run)}
     (folder / "summary.json").write_text(json.dumps({**result, **summary}, indent=1) + "\n")
-    text = _text(folder, result, summary, _pictures(source), run)
+    text = "\n".join((*_headline(source, plan), *_text(folder, result, summary, _pictures(source), run)))
     (folder / "summary.txt").write_text(text + "\n")
     return text
 
@@ -208,13 +209,38 @@ def _statistics(error: Array) -> dict[str, dict[str, float]]:
     }
 
 
-def _text(folder: Path, result: dict[str, Any], summary: dict[str, Any], pictures: Sequence[Path], run: Run) -> str:
-    lines = []
-    if result:
-        lines.append(f"{result['cell']}: {result['task']} {result['outcome']} after {result['duration_s']:.2f} s")
-        if result["reason"]:
+def _headline(source: RunFolder, plan: CellPlan | None) -> list[str]:
+    """Return how the run ended, and how much of it is recorded where that is not all."""
+    result, run = source.result, source.recording
+    recorded_s = max((float(series.t_s[-1]) for series in run.topics.values()), default=0.0)
+    if {"cell", "task", "outcome", "duration_s"} <= result.keys():
+        lines = [f"{result['cell']}: {result['task']} {result['outcome']} after {float(result['duration_s']):.2f} s"]
+        if result.get("reason"):
             lines.append(f"  {result['reason']}")
-    lines += [f"  {_ENDED[name].format(summary[name])}" for name in _ENDED if name in summary]
+    else:
+        name = source.path.resolve().name if plan is None else f"{plan.cell.name}: {plan.task.name}"
+        lines = [f"{name} has no result after {recorded_s:.2f} s: " + _without_result(source.path)]
+    if run.damage:
+        count = len(run.damage)
+        lines.append(
+            f"  recorded until {recorded_s:.2f} s, damaged in {count} place{'s' if count > 1 else ''}, "
+            f"first {run.damage[0]}; what follows is of what can be read"
+        )
+    return lines
+
+
+def _without_result(folder: Path) -> str:
+    if is_running(folder):
+        return "it is in progress"
+    if (folder / RESULT).exists():
+        return f"{RESULT} is damaged"
+    return "it was killed, crashed, or there was no memory left"
+
+
+def _text(
+    folder: Path, result: dict[str, Any], summary: dict[str, Any], pictures: Sequence[Path], run: Run
+) -> list[str]:
+    lines = [f"  {_ENDED[name].format(summary[name])}" for name in _ENDED if name in summary]
     lines += [f"  {line}" for line in summary.get("close_calls", ())]
     for sensor, kinds in summary["errors"].items():
         lines.append(f"{sensor}, error RMS    " + "".join(f"{name:>11}" for name in COMPONENTS))
@@ -236,12 +262,10 @@ def _text(folder: Path, result: dict[str, Any], summary: dict[str, Any], picture
         lines += [
             f"  {stage:<18}{row['median']:11.1f}{row['p99']:11.1f}{row['count']:9d}" for stage, row in stages.items()
         ]
-    if run.damage:
-        lines.append(f"the recording is damaged in {len(run.damage)} places, first {run.damage[0]}")
     lines += compiled.missing()
     lines.append(f"run folder: {folder}")
     lines += [f"  {picture.name}" for picture in pictures]
-    return "\n".join(lines)
+    return lines
 
 
 _HEALTH = "/health/"

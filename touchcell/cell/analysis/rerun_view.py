@@ -10,8 +10,9 @@ import rerun.blueprint as rrb
 import rerun_cli
 
 from touchcell.cell.analysis.run_folder import RunFolder
-from touchcell.cell.recording.mcap import RECORDING, read
+from touchcell.cell.recording.mcap import RECORDING, read, wall_clock_offset_ns
 from touchcell.cell.recording.recorded_images import is_image
+from touchcell.cell.recording.salvage import whole
 from touchcell.cell.recording.viewer_record import LOG_TOPIC
 from touchcell.cell.scene.description import SceneDescription, describe_scene
 from touchcell.cell.scene.frames import WORLD
@@ -43,7 +44,9 @@ def show_in_rerun(folder: Path, target: Path | None = None) -> None:
         )
     else:
         recording.save(target, default_blueprint=blueprint)
-    recording.log_file_from_path(folder / RECORDING)
+    with whole(folder / RECORDING) as readable:
+        recording.log_file_from_path(readable)
+        recording.flush()
     _log_scene(recording, scene)
     _log_numbers(recording, run)
     recording.flush()
@@ -100,7 +103,7 @@ def _log_scene(recording: rr.RecordingStream, scene: SceneDescription) -> None:
 
 def _log_numbers(recording: rr.RecordingStream, run: RunFolder) -> None:
     """Log depths and speeds as scalars on the recording's own timeline."""
-    offset_ns = _offset_ns(run.path / RECORDING)
+    offset_ns = wall_clock_offset_ns(run.path / RECORDING)
     for kind, leaf, column, name in (("sensors", "contact", "z_mm", "depth_mm"), ("arms", "tcp", "speed_mm_s", "")):
         for role in run.recording.roles(kind, leaf):
             series = run.recording.series(f"/{kind}/{role}/{leaf}")
@@ -111,15 +114,3 @@ def _log_numbers(recording: rr.RecordingStream, run: RunFolder) -> None:
                 indexes=[rr.TimeColumn("message_log_time", timestamp=stamps.astype("datetime64[ns]"))],
                 columns=rr.Scalars.columns(scalars=series.column(column)),
             )
-
-
-def _offset_ns(recording: Path) -> int:
-    """Return wall clock minus the cell's clock of a recording."""
-    from mcap.reader import make_reader
-
-    from touchcell.cell.recording.mcap import CELL_CLOCK
-
-    with recording.open("rb") as stream:
-        for _, channel, _ in make_reader(stream).iter_messages():
-            return int(channel.metadata.get(CELL_CLOCK, 0))
-    return 0

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +15,7 @@ from numpy.typing import NDArray
 from touchcell.cell.analysis.run_data import Run, Series, load_run, tip_points
 from touchcell.cell.config.cell_plan import CellPlan
 from touchcell.cell.config.schema import plan_cell
+from touchcell.cell.runtime.result_record import RESULT
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 
@@ -27,6 +30,15 @@ class RunFolder:
     def plan(self) -> CellPlan:
         """Its cell. Raises ConfigError."""
         return plan_cell(self.path / "cell.yaml", to_run=False)
+
+    @cached_property
+    def result(self) -> dict[str, Any]:
+        """How it ended, as ``result.json`` says; empty where there is none that can be read."""
+        try:
+            found = json.loads((self.path / RESULT).read_text())
+        except (OSError, ValueError, RecursionError):
+            return {}
+        return found if isinstance(found, dict) else {}
 
     @cached_property
     def recording(self) -> Run:

@@ -114,24 +114,21 @@ def _evidence(folder: Path) -> _Evidence | None:
     if (folder / RING).exists():
         about, messages = read_left_ring(folder)
         return _Evidence(about, run_of(messages), RING)
-    if (folder / ABOUT).exists():
-        return _Evidence(_record(folder / ABOUT), load_run(folder / MESSAGES), MESSAGES)
-    about = _record(folder / RESULT) if (folder / RESULT).exists() else {}
+    if (about := _record(folder / ABOUT)) and (folder / MESSAGES).exists():
+        return _Evidence(about, load_run(folder / MESSAGES), MESSAGES)
+    about = RunFolder(folder).result
     if (folder / RECORDING).exists():
         return _Evidence(about, load_run(folder / RECORDING), RECORDING)
     return _Evidence(about, run_of([]), RESULT) if about else None
 
 
 def _record(file: Path) -> dict[str, Any]:
+    """Return what a black box is of; empty where nothing can be read, so that the recording answers in its place."""
     try:
         about = json.loads(file.read_text())
-    except OSError as error:
-        raise RecordingError(file, f"cannot be read: {error.strerror}") from None
-    except (ValueError, RecursionError):
-        raise RecordingError(file, "is damaged") from None
-    if not isinstance(about, dict):
-        raise RecordingError(file, "is damaged")
-    return about
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return about if isinstance(about, dict) else {}
 
 
 def _crash(file: Path) -> list[str]:
@@ -167,7 +164,7 @@ def _cause(cause: dict[str, Any]) -> str:
     return text + (f", tactile frame {cause['frame_seq']}" if cause["frame_seq"] is not None else "")
 
 
-_REMEDIES: Final = {
+REMEDIES: Final = {
     "limited": "lower the task's gains or speeds, raise that limit of the arm if it can do more, or, where the "
     "estimate itself jumps, train the estimator on more images",
     "workspace": "if the task was right to go there, make the box larger; if not, look at its start and its target",
@@ -179,7 +176,32 @@ _REMEDIES: Final = {
     "tcp_speed": "lower the task's speeds or gains; the limit is for the tool, with the turn about it",
     "tracking": "the arm does not follow: look at its load, its own speed limits and what it touches",
     "contact_lost": "lower the speed, raise the depth, or let the task search again more often",
+    "frame_frozen": "see whether the camera still delivers new pictures: cable, power, `touchcell probe`",
+    "exposure": "bring light and camera back to what they were when the run began",
+    "uncertain": "press less deep and less slanted, or train the estimator on the contacts that occur",
+    "inconsistent": "lower the speed, or give the filter more drift: it expects less motion than there is",
+    "shear": "lower the speed or the depth: the skin is dragged further than it can follow",
+    "slip": "lower the speed, or press a little deeper: the skin slides",
+    "torsion": "turn more slowly, or lower the depth",
+    "markers_lost": "look at the images: light, focus, dirt, or a tip that has shifted",
+    "tilt": "see whether the surface is steeper than the cone, and whether the task's gains about it are too high",
+    "depth_disagrees": "calibrate the sensor's zero and its mount, or train the estimator for this tip",
+    "standstill": "something moves an arm that is to stand: look at its brakes, its load and what pushes it",
+    "clearance": "move the start, the target or the obstacle, or choose a path that leaves more room",
+    "out_of_step": "lower the speed of the push, or the load that one arm takes more of than the other",
+    "object_lost": "raise the follower's depth, or push more slowly",
+    "toppling": "push lower, more slowly, or with less force",
+    "pressure": "lower speed, depth or stiffness: the limit is for people",
+    "wrench": "lower speed, depth or gains, and see whether the sensor was zeroed with this tool",
+    "external_torque": "see what touches the arm, and whether its load and tool are set as they are",
+    "reading": "see why the device reports that number (its log, `touchcell probe`)",
+    "reading_age": "find what delays the device or the cycle (budget.png)",
+    "hold_to_run": "hold the enabling device, then reset",
+    "overrun": "find what else the machine does, or lower rate_hz (budget.png shows where a cycle's time goes)",
+    "finite": "see which device delivers what is no number; nothing can be decided without it",
+    "missing": "see why a device delivers nothing (its log, `touchcell probe`)",
 }
+"""What to do about a trip, by kind of interlock."""
 
 
 def _remedy(folder: Path, cause: dict[str, Any]) -> str:
@@ -188,7 +210,8 @@ def _remedy(folder: Path, cause: dict[str, Any]) -> str:
         entry = load(folder / "cell.yaml").data.get("interlocks", {}).get(cause["interlock"], {})
     except (ConfigError, AttributeError):
         return ""
-    return _REMEDIES.get(str(entry.get("kind")), "") if isinstance(entry, dict) else ""
+    # Those that are always on need no entry, and are named by their kind.
+    return REMEDIES.get(str(entry.get("kind", cause["interlock"])), "") if isinstance(entry, dict) else ""
 
 
 def _stop(stop: dict[str, Any]) -> str:

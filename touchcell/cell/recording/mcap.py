@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import logging
+import re
 import struct
 import zlib
 from collections.abc import Callable, Iterator
@@ -49,7 +50,8 @@ _LONGEST_CHUNK: Final = 1 << 26
 _MOST_EXPANSION: Final = 50
 _USUAL_CHUNK: Final = 1 << 20
 # A chunk's compression, as a prefixed string, and how far it is behind the chunk's first byte.
-_CHUNK_MARK: Final = b"\x03\x00\x00\x00lz4"
+_CHUNK_MARK: Final = re.compile(rb"\x03\x00\x00\x00lz4|\x04\x00\x00\x00zstd")
+_LONGEST_MARK: Final = 8
 _CHUNK_MARK_AT: Final = _RECORD_HEAD + 8 + 8 + 8 + 4
 
 
@@ -85,8 +87,11 @@ def read(path: Path, damage: list[Damage] | None = None) -> Iterator[Message]:
     """
     found: list[Damage] = [] if damage is None else damage
     with _opened(path) as stream:
-        if stream.read(len(_MAGIC)) != _MAGIC:
-            raise RecordingError(path, "is not an MCAP file")
+        if (magic := stream.read(len(_MAGIC))) != _MAGIC:
+            empty = _MAGIC.startswith(magic)
+            raise RecordingError(
+                path, "is empty: its writer ended before anything was written" if empty else "is not an MCAP file"
+            )
         yield from _Reader(stream, lambda: False, found).messages()
     if damage is None:
         for each in found:
@@ -121,6 +126,19 @@ def _opened(path: Path) -> IO[bytes]:
         return path.open("rb")
     except OSError as error:
         raise RecordingError(path, f"cannot be read: {error.strerror}") from None
+
+
+def wall_clock_offset_ns(path: Path) -> int:
+    """Return wall clock minus the cell's clock of a recording, whole or not; 0 where nothing says it.
+
+    Raises:
+        RecordingError: ``path`` cannot be read.
+    """
+    with _opened(path) as stream:
+        stream.seek(len(_MAGIC))
+        reader = _Reader(stream, lambda: False, [])
+        next(reader.messages(), None)
+        return next((channel.offset_ns for channel in reader.channels), 0)
 
 
 class _Damaged(Exception):
@@ -160,6 +178,11 @@ class _Reader:
         self._searched = False
         self._delivered = 0
         self._promised: int | None = None
+
+    @property
+    def channels(self) -> list[_Channel]:
+        """The channels that were described so far."""
+        return list(self._channels.values())
 
     def bytes_at(self, offset: int, count: int) -> bytes | None:
         """``count`` bytes at ``offset``; None if the file ends before and nothing more comes."""
@@ -297,13 +320,12 @@ class _Reader:
         at = offset
         while block := self._stream.read(_BLOCK_BYTES):
             held = overlap + block
-            place = -1
-            while (place := held.find(_CHUNK_MARK, place + 1)) >= 0:
-                start = at - len(overlap) + place - _CHUNK_MARK_AT
+            for mark in _CHUNK_MARK.finditer(held):
+                start = at - len(overlap) + mark.start() - _CHUNK_MARK_AT
                 if start >= offset and self._is_kind(start, Opcode.CHUNK):
                     return start
             at += len(block)
-            overlap = held[-len(_CHUNK_MARK) :]
+            overlap = held[1 - _LONGEST_MARK :]
             self._stream.seek(at)
         return None
 

@@ -1,8 +1,9 @@
 """A ring of messages in a file of fixed size that outlives its writer: a kill, a crash, a full disk.
 
-The file's blocks are allocated before the first message, and each message is handed to the kernel in one call: what was
-added is in the file whatever becomes of the process, and no message needs room on the disk. (Writing through a mapping
-would be as lasting, but ends the process by SIGBUS where the file is truncated or its blocks are copied on write.)
+The file's blocks are allocated before the first message, and messages are handed to the kernel as they are added, those
+of a control cycle in one call: what was added is in the file whatever becomes of the process, and no message needs room
+on the disk. (Writing through a mapping would be as lasting, but ends the process by SIGBUS where the file is truncated
+or its blocks are copied on write.)
 
 The ring is a row of segments. Records follow each other within a segment, each with a running number and a checksum; a
 reader takes a segment's records as long as both fit, so neither torn records nor those of an earlier round are read.
@@ -16,7 +17,7 @@ import json
 import os
 import struct
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -62,7 +63,7 @@ class RingWriter:
         self._types: list[MessageType] = []
         self._numbers: dict[int, int] = {}
         self._types_at = 0
-        self._topics: dict[str, bytes] = {}
+        self._headings: dict[tuple[str, int], tuple[int, bytes]] = {}
         self._failed = False
         try:
             if path is None:
@@ -86,35 +87,52 @@ class RingWriter:
         """Whether a write has failed; nothing more is written then."""
         return self._failed
 
-    def add(self, topic: str, t_ns: int, message: Encoded) -> None:
-        """Append one message; one that is longer than a segment, or comes after a failure, is left out."""
-        name = self._topics.get(topic)
-        if name is None:
-            name = self._topics[topic] = topic.encode()[:_LONGEST_TOPIC]
-        length = len(name) + _NUMBER.size + len(message.data)
-        whole = _RECORD.size + length
-        if self._failed or whole > self._segment_bytes:
+    def add(self, messages: Iterable[tuple[str, int, Encoded]]) -> None:
+        """Append topics, stamps and messages, in one call of the kernel for each segment that they reach.
+
+        One that is longer than a segment, or comes after a failure, is left out.
+        """
+        at, pieces = self._at, list[bytes]()
+        for topic, t_ns, message in messages:
+            heading = self._headings.get((topic, id(message.type)))
+            if heading is None:
+                heading = self._heading(topic, message.type)
+                if heading is None:
+                    continue
+            name_length, name = heading
+            data = message.data
+            length = len(name) + len(data)
+            whole = _RECORD.size + length
+            if self._failed or whole > self._segment_bytes:
+                continue
+            if self._at + whole > self._segment_bytes:
+                self._put(at, pieces)
+                self._segment, self._at = (self._segment + 1) % _SEGMENTS, 0
+                at, pieces = 0, []
+            self._number += 1
+            body = b"".join((_BODY.pack(length, self._number, t_ns, name_length), name, data))
+            pieces += (_CHECK.pack(zlib.crc32(body)), body)
+            self._at += whole
+        self._put(at, pieces)
+
+    def _put(self, at: int, pieces: list[bytes]) -> None:
+        if not pieces:
             return
-        type_number = self._numbers.get(id(message.type))
-        if type_number is None:
-            type_number = self._describe(message.type)
-            if type_number is None:
-                return
-        if self._at + whole > self._segment_bytes:
-            self._segment, self._at = (self._segment + 1) % _SEGMENTS, 0
-        self._number += 1
-        body = b"".join(
-            (_BODY.pack(length, self._number, t_ns, len(name)), name, _NUMBER.pack(type_number), message.data)
-        )
         try:
-            os.pwrite(
-                self._fd,
-                _CHECK.pack(zlib.crc32(body)) + body,
-                _SEGMENTS_AT + self._segment * self._segment_bytes + self._at,
-            )
+            os.pwrite(self._fd, b"".join(pieces), _SEGMENTS_AT + self._segment * self._segment_bytes + at)
         except OSError:
             self._failed = True
-        self._at += whole
+
+    def _heading(self, topic: str, type_: MessageType) -> tuple[int, bytes] | None:
+        """Return the length of a topic's name, and the name with the number of the type; None without room for that."""
+        number = self._numbers.get(id(type_))
+        if number is None:
+            number = self._describe(type_)
+            if number is None:
+                return None
+        name = topic.encode()[:_LONGEST_TOPIC]
+        self._headings[topic, id(type_)] = found = len(name), name + _NUMBER.pack(number)
+        return found
 
     def _describe(self, type_: MessageType) -> int | None:
         """Keep a type; None where there is no room for it."""

@@ -15,7 +15,9 @@ from touchcell.cell.recording.well_known import (
     SCENE_UPDATE,
     BeliefMessage,
     JointMessage,
+    Pose,
     TransformMessage,
+    drawn_pose,
     log_message,
     scene_message,
 )
@@ -39,6 +41,8 @@ SCENE_TOPIC: Final = "/scene"
 LOG_TOPIC: Final = "/log"
 _PICTURE_NS: Final = round(1e9 / 30.0)
 """What is drawn is for the eye, which sees no more pictures a second; the numbers are recorded in every cycle."""
+_BELIEF_NS: Final = 100_000_000
+"""Where the contact is felt, and how surely, is among the numbers of every cycle; its full covariance is not."""
 _AGAIN_NS: Final = 1_000_000_000
 _LEVELS: Final[dict[Severity, str]] = {Severity.LIMIT: "WARNING", Severity.TRIP: "ERROR", Severity.FAULT: "FATAL"}
 
@@ -57,13 +61,16 @@ class ViewerRecord:
         self._scene = scene
         self._scene_start_ns = scene_start_ns
         self._transforms: dict[str, tuple[str, TransformMessage]] = {}
+        self._drawn: dict[str, Pose] = {}
         self._beliefs: dict[str, tuple[str, BeliefMessage]] = {}
+        self._next_belief_ns: dict[str, int] = {}
         self._joints = {role: JointMessage(chain.joint_names) for role, chain in scene.chains.items()}
         self._next_ns = self._begun_ns = -(1 << 62)
 
     def begin(self, t_ns: int) -> None:
         """Write what stands still, and everything that is drawn."""
         self._begun_ns = t_ns
+        self._drawn.clear()
         for frame in self._scene.frames:
             self._transform(frame.parent, frame.name, t_ns, frame.T_parent_frame)
         parts = sorted(self._scene.parts, key=lambda part: (part.name, part.frame))
@@ -101,15 +108,18 @@ class ViewerRecord:
         if belief is None:
             return
         frame = sensor_frame(role)
+        self._transform(frame, contact_frame(role), estimate.t_ns, belief.mean)
+        if estimate.t_ns < self._next_belief_ns.get(role, estimate.t_ns):
+            return
+        self._next_belief_ns[role] = estimate.t_ns + _BELIEF_NS
         known = self._beliefs.get(role)
         if known is None:
             known = self._beliefs[role] = f"/sensors/{role}/belief", BeliefMessage(frame)
         topic, message = known
         t_wall_ns = estimate.t_ns + self._recorder.wall_offset_ns
         self._recorder.write_bytes(
-            topic, estimate.t_ns, POSE_IN_FRAME, message.encode(t_wall_ns, belief.mean, belief.covariance)
+            topic, estimate.t_ns, POSE_IN_FRAME, message.encode(t_wall_ns, drawn_pose(belief.mean), belief.covariance)
         )
-        self._transform(frame, contact_frame(role), estimate.t_ns, belief.mean)
 
     def objects(self, objects: Stamped[Mapping[str, Array]]) -> None:
         """Write where the free objects of the scene are."""
@@ -147,9 +157,14 @@ class ViewerRecord:
     def _transform(self, parent: str, frame: str, t_ns: int, T_parent_frame: Array) -> None:
         if not all_finite(T_parent_frame):
             return
+        pose = drawn_pose(T_parent_frame)
+        # A frame stays where it was until it is written again.
+        if self._drawn.get(frame) == pose:
+            return
+        self._drawn[frame] = pose
         known = self._transforms.get(frame)
         if known is None:
             known = self._transforms[frame] = f"/frames/{frame}", TransformMessage(parent, frame)
         topic, message = known
-        data = message.encode(t_ns + self._recorder.wall_offset_ns, T_parent_frame)
+        data = message.encode(t_ns + self._recorder.wall_offset_ns, pose)
         self._recorder.write_bytes(topic, t_ns, FRAME_TRANSFORM, data)

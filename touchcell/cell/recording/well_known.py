@@ -5,6 +5,7 @@ A schema of that package may have more fields than its own, which viewers skip.
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -22,6 +23,7 @@ COVARIANCE_FIELD: Final = "covariance"
 """Field of ``foxglove.PoseInFrame`` that is ours: (36,) of x, y, z, rx, ry, rz along the frame's axes, m and rad."""
 _COVARIANCE_NUMBER: Final = 100
 _LINE_M: Final = 0.0015
+_SINGLES: Final = struct.Struct("<7f")
 
 
 @dataclass(frozen=True)
@@ -64,35 +66,74 @@ JOINT_STATES: Final = WellKnown("JointStates")
 LOG: Final = WellKnown("Log")
 
 
+Pose = tuple[float, ...]
+"""Pose as viewers take it: x, y, z in m and the quaternion x, y, z, w, all of single precision, which compresses."""
+
+
+def drawn_pose(T: Array) -> Pose:
+    """Return a pose (4, 4) for viewers."""
+    return _SINGLES.unpack(_SINGLES.pack(*T[:3, 3].tolist(), *quaternion(T[:3, :3])))
+
+
 class TransformMessage:
     """Encodes the poses of one frame in its parent, again and again."""
 
     def __init__(self, parent: str, frame: str) -> None:
         message: Any = FRAME_TRANSFORM.new(parent_frame_id=parent, child_frame_id=frame)
-        self._message = message
-        self._stamp, self._translation, self._rotation = message.timestamp, message.translation, message.rotation
+        self._template = _PoseTemplate(message, message.translation, message.rotation)
 
-    def encode(self, t_wall_ns: int, T_parent_frame: Array) -> bytes:
-        """Return the pose (4, 4) as bytes."""
-        _put_stamp(self._stamp, t_wall_ns)
-        _put_pose(self._translation, self._rotation, T_parent_frame)
-        return self._message.SerializeToString()  # type: ignore[no-any-return]
+    def encode(self, t_wall_ns: int, pose: Pose) -> bytes:
+        """Return the pose as bytes."""
+        return self._template.encode(t_wall_ns, pose)
 
 
 class BeliefMessage:
     """Encodes Gaussians over the pose of something in one frame."""
 
     def __init__(self, frame: str) -> None:
-        self._message: Any = POSE_IN_FRAME.new(frame_id=frame)
+        message: Any = POSE_IN_FRAME.new(frame_id=frame)
+        self._template = _PoseTemplate(message, message.pose.position, message.pose.orientation)
+        # Serialized with 36 numbers once, for the field's tag and length.
+        message = POSE_IN_FRAME.new(**{COVARIANCE_FIELD: [1.0] * 36})
+        self._covariance: bytes = message.SerializeToString()[: -36 * 8]
 
-    def encode(self, t_wall_ns: int, T_frame_thing: Array, covariance: Array) -> bytes:
-        """Return a pose (4, 4) with its covariance (6, 6) along the axes of the frame, m and rad, as bytes."""
-        message = self._message
-        _put_stamp(message.timestamp, t_wall_ns)
-        _put_pose(message.pose.position, message.pose.orientation, T_frame_thing)
-        del message.covariance[:]
-        message.covariance.extend(covariance.ravel().tolist())
-        return message.SerializeToString()  # type: ignore[no-any-return]
+    def encode(self, t_wall_ns: int, pose: Pose, covariance: Array) -> bytes:
+        """Return a pose with its covariance (6, 6) along the axes of the frame, m and rad, as bytes."""
+        numbers = covariance.astype(np.float32).astype("<f8").tobytes()
+        return self._template.encode(t_wall_ns, pose) + self._covariance + numbers
+
+
+class _PoseTemplate:
+    """A message with a stamp and one pose, serialized once: only both are put in.
+
+    Args:
+        message: with all else that it has.
+        position, orientation: of its pose.
+    """
+
+    def __init__(self, message: Any, position: Any, orientation: Any) -> None:
+        # Numbers that are nowhere else in the message, to find their places.
+        marks = [1.0e-300 * k for k in range(1, 8)]
+        position.x, position.y, position.z = marks[:3]
+        orientation.x, orientation.y, orientation.z, orientation.w = marks[3:]
+        rest = message.SerializeToString()
+        items: list[Any] = []
+        for mark in marks:
+            before, _, rest = rest.partition(struct.pack("<d", mark))
+            items += (before, 0.0)
+        items.append(rest)
+        self._items = items
+        self._pack = struct.Struct("<" + "".join(f"{len(text)}sd" for text in items[:-1:2]) + f"{len(rest)}s").pack
+        self._stamp = message.timestamp
+        number = message.DESCRIPTOR.fields_by_name["timestamp"].number
+        self._stamp_tag = bytes((number << 3 | 2,))
+
+    def encode(self, t_wall_ns: int, pose: Pose) -> bytes:
+        items = self._items.copy()
+        items[1::2] = pose
+        _put_stamp(self._stamp, t_wall_ns)
+        stamp = self._stamp.SerializeToString()
+        return b"".join((self._pack(*items), self._stamp_tag, bytes((len(stamp),)), stamp))
 
 
 class JointMessage:

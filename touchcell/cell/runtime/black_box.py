@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from types import TracebackType
@@ -52,9 +52,9 @@ class BlackBox:
         self._about = dict(about or {})
         self._ring = RingWriter(None if folder is None else folder / RING, _RING_BYTES, self._about)
 
-    def add(self, topic: str, t_ns: int, message: Encoded) -> None:
-        """Keep one message that is encoded as for the recording; never fails."""
-        self._ring.add(topic, t_ns, message)
+    def add(self, messages: Sequence[tuple[str, int, Encoded]]) -> None:
+        """Keep topics, stamps and messages that are encoded as for the recording; never fails."""
+        self._ring.add(messages)
 
     def messages(self) -> list[Message]:
         """Those of the last ten seconds, oldest first."""
@@ -83,7 +83,7 @@ class BlackBox:
         }
         messages = self.messages()
         end = Encoder(declared_type).encode(_END_TOPIC, {"json": json.dumps(record)})
-        self._ring.add(_END_TOPIC, messages[-1].t_ns if messages else 0, end)
+        self._ring.add([(_END_TOPIC, messages[-1].t_ns if messages else 0, end)])
         self._ring.sync()
         try:
             self._write(folder, messages, record)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, Final, Protocol
 
@@ -47,8 +47,8 @@ _LEVELS_NS: Final = 100_000_000
 class Box(Protocol):
     """Something that keeps messages and never fails; see ``touchcell.cell.runtime.black_box``."""
 
-    def add(self, topic: str, t_ns: int, message: Encoded) -> None:
-        """Keep one message, encoded as for the recording."""
+    def add(self, messages: Sequence[tuple[str, int, Encoded]]) -> None:
+        """Keep topics, stamps and messages, encoded as for the recording."""
         ...
 
 
@@ -66,6 +66,7 @@ class RunRecord:
         self._recorder = recorder
         self._box = box
         self._encoder = recorder.encoder if recorder is not None else Encoder(declared_type)
+        self._pending: list[tuple[str, int, Encoded]] = []
         self._transitions_written = 0
         self._zeros = 0
         self._levels_ns = -(1 << 62)
@@ -118,53 +119,66 @@ class RunRecord:
         """Record everything about one control cycle."""
         if self._recorder is None and self._box is None:
             return
-        cell, now_ns = self._cell, reading.now_ns
         if self._frames is not None:
             self._write_frames(self._frames)
+        try:
+            self._cycle(reading, action, sent, verdict, times)
+        finally:
+            self._keep()
+
+    def _cycle(
+        self,
+        reading: Reading,
+        action: Action,
+        sent: Mapping[str, Sent[TwistCommand]],
+        verdict: Verdict,
+        times: CycleTimes,
+    ) -> None:
+        cell, now_ns = self._cell, reading.now_ns
         for role, state in reading.states.items():
-            self.write(f"/arms/{role}/tcp", state.t_ns, tcp_message(state))
+            self._add(f"/arms/{role}/tcp", state.t_ns, tcp_message(state))
         for role, wrench in reading.wrenches.items():
-            self.write(f"/arms/{role}/wrench", wrench.t_ns, values_message(wrench))
+            self._add(f"/arms/{role}/wrench", wrench.t_ns, values_message(wrench))
         for role, torque in reading.external_torques.items():
-            self.write(f"/arms/{role}/external_torque", torque.t_ns, values_message(torque))
+            self._add(f"/arms/{role}/external_torque", torque.t_ns, values_message(torque))
         for role, estimate in reading.contacts.items():
-            self.write(f"/sensors/{role}/contact", now_ns, contact_message(estimate))
+            self._add(f"/sensors/{role}/contact", now_ns, contact_message(estimate))
         for role, sensor in cell.sensors.items():
             for topic, t_ns, message in sensor.extra_messages(now_ns):
-                self.write(f"/sensors/{role}/{topic}", t_ns, message)
+                self._add(f"/sensors/{role}/{topic}", t_ns, message)
             if self._frames is not None and (frame := sensor.new_frame()) is not None:
                 self._frames.add(role, frame.t_ns, frame.value.image)
         for name, health in reading.health.items():
-            self.write(f"/health/{name}", health.t_ns, {"seq": health.seq, **health.value})
+            self._add(f"/health/{name}", health.t_ns, {"seq": health.seq, **health.value})
         for role, sample in reading.devices.items():
-            self.write(f"/devices/{role}/reading", sample.t_ns, {"seq": sample.seq, **sample.value})
+            self._add(f"/devices/{role}/reading", sample.t_ns, {"seq": sample.seq, **sample.value})
         if verdict.allow:
             for role, setting in action.settings.items():
-                self.write(f"/devices/{role}/setting", now_ns, setting)
+                self._add(f"/devices/{role}/setting", now_ns, setting)
         objects = None if cell.scene is None else cell.scene.objects()
         if objects is not None:
             for name, T_world_object in objects.value.items():
-                self.write(f"/objects/{name}", objects.t_ns, pose_message(T_world_object))
+                self._add(f"/objects/{name}", objects.t_ns, pose_message(T_world_object))
         for role, command in sent.items():
-            self.write(f"/arms/{role}/command", command.t_ns, command_message(command))
+            self._add(f"/arms/{role}/command", command.t_ns, command_message(command))
         if verdict.violations or not verdict.allow:
-            self.write("/safety", now_ns, verdict_message(verdict))
+            self._add("/safety", now_ns, verdict_message(verdict))
             if self._viewers is not None:
                 self._view(partial(self._viewers.violations, now_ns, verdict.violations))
         if now_ns >= self._levels_ns:
             self._levels_ns = now_ns + _LEVELS_NS
-            self.write("/interlocks", now_ns, levels_message(cell.supervisor.levels()))
-        self.write("/task", now_ns, {"state": cell.task.state, **action.telemetry})
-        self.write("/timing", now_ns, times.message())
-        if self._viewers is not None:
-            self._view(partial(self._draw, self._viewers, reading, objects))
+            self._add("/interlocks", now_ns, levels_message(cell.supervisor.levels()))
+        self._add("/task", now_ns, {"state": cell.task.state, **action.telemetry})
+        self._add("/timing", now_ns, times.message())
         for record in cell.task.transitions[self._transitions_written :]:
-            self.write(
+            self._add(
                 _EVENTS,
                 record.t_ns,
                 {"event": record.event, "from": record.source, "to": record.target, "reason": record.reason},
             )
             self._transitions_written += 1
+        if self._viewers is not None and self._viewers.is_due(now_ns):
+            self._view(partial(self._draw, self._viewers, reading, objects))
 
     def keep_frames(self, contacts: Mapping[str, ContactEstimate], action: Action) -> None:
         """Keep every frame that the task has labelled, and once what a sensor sees while it touches nothing."""
@@ -194,25 +208,34 @@ class RunRecord:
         """Record one message."""
         if self._box is None and self._recorder is None:
             return
+        self._add(topic, t_ns, message)
+        self._keep()
+
+    def _add(self, topic: str, t_ns: int, message: Mapping[str, Any]) -> None:
+        """Encode one message, to be kept with all others of its cycle."""
         try:
-            encoded = self._encoder.encode(topic, message)
+            self._pending.append((topic, t_ns, self._encoder.encode(topic, message)))
         except Exception as error:
             # A value of a plug-in's that is neither number, text, list nor mapping; the rest of the run is recorded.
             logger.exception("a message of %s is left out", topic)
             self.error = self.error or UnexpectedError(error)
             return
+        if topic == _EVENTS and self._viewers is not None:
+            self._view(partial(self._viewers.event, t_ns, message))
+
+    def _keep(self) -> None:
+        """Hand what is encoded to the black box first, and to the recording."""
+        pending, self._pending = self._pending, []
         if self._box is not None:
             try:
-                self._box.add(topic, t_ns, encoded)
+                self._box.add(pending)
             except Exception:
                 logger.exception("the black box failed and takes no more messages")
                 self._box = None
         if self._recorder is None:
             return
-        if topic == _EVENTS and self._viewers is not None:
-            self._view(partial(self._viewers.event, t_ns, message))
         try:
-            self._recorder.write_encoded(topic, t_ns, encoded)
+            self._recorder.write_encoded(pending)
         except RecordingError as error:
             self._give_up(error)
         except Exception as error:
@@ -233,8 +256,6 @@ class RunRecord:
 
     def _draw(self, viewers: ViewerRecord, reading: Reading, objects: Stamped[Mapping[str, Array]] | None) -> None:
         """Record for viewers where everything is, as often as they show it."""
-        if not viewers.is_due(reading.now_ns):
-            return
         for role, state in reading.states.items():
             viewers.arm(role, state)
         for role, arm in self._jointed.items():

@@ -174,7 +174,8 @@ class RunPage:
                             sensor: ui.image().classes("w-full max-w-sm") for sensor in self._view.plan.sensor_roles
                         }
                     self._no_images = ui.label().classes("text-gray-500")
-                with ui.card().classes("w-full min-w-0"):
+                # Over both columns: its labels are read, not only its shape.
+                with ui.card().classes("w-full min-w-0 lg:col-span-2"):
                     _title("States")
                     self._diagram = ui.mermaid(_diagram(self._table, "")).classes("w-full overflow-x-auto")
                     self._shown_state = ""
