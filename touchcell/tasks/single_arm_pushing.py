@@ -15,10 +15,11 @@ from touchcell.geometry.types import Array
 from touchcell.tasks.contact_servo import ContactServoConfig, Six, SixGains
 from touchcell.tasks.free_motion import Goal
 from touchcell.tasks.interface import SPEED
+from touchcell.tasks.planned_motions import PlannedMotion, PlannedTime
 from touchcell.tasks.planned_places import PlannedPlace
 from touchcell.tasks.predictive_push import PredictivePush, PredictivePushSettings, Progress, twist_in_sensor
 from touchcell.tasks.push_path import Obstacle, plan
-from touchcell.tasks.servoing import ARM, ServoConfig, one_arm_task
+from touchcell.tasks.servoing import ARM, ServoConfig, one_arm_task, servo_motions
 
 Mm = tuple[float, float]
 _SIGMAS = 2.0
@@ -334,6 +335,18 @@ def _aim_of(progress: Progress) -> Aim:
     )
 
 
+def _motions(config: SingleArmPushingConfig, T_base_tcp: Array | None, T_tcp_sensor: Array) -> Iterator[PlannedMotion]:
+    """Return how long the push takes at least, from where an approach may have made contact, besides the rest."""
+    yield from servo_motions(config)
+    if T_base_tcp is None:
+        return
+    tip_mm = 1e3 * (T_base_tcp @ T_tcp_sensor)[:2, 3]
+    way_mm = math.dist(tip_mm, config.target_mm) - config.approach_distance_mm
+    way_mm -= config.object_center_offset_mm + config.arrival_tolerance_mm
+    takes_s = max(way_mm, 0.0) / config.push_speed_mm_s
+    yield PlannedTime(("push_timeout_s",), takes_s, config.push_timeout_s, "to push so far")
+
+
 SPEC = one_arm_task(
     "single_arm_pushing",
     "push an object over a table to a target, steering it by touch",
@@ -341,4 +354,5 @@ SPEC = one_arm_task(
     Push,
     lambda config: config.reference_mm_deg,
     lambda config, start, mount: config.planned_places(ARM),
+    _motions,
 )
