@@ -187,7 +187,7 @@ def test_a_speed_above_what_it_measured_while_it_stood_is_a_motion_that_has_begu
     )
 
 
-@pytest.mark.parametrize(("begun_ms", "at_rest"), [(50, False), (95, False), (150, True)])
+@pytest.mark.parametrize(("begun_ms", "at_rest"), [(50, False), (95, False), (100, False), (101, True), (150, True)])
 def test_what_is_measured_for_a_tenth_of_a_second_while_the_positions_stay_is_usual(
     begun_ms: int, at_rest: bool
 ) -> None:

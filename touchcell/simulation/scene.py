@@ -36,6 +36,7 @@ from touchcell.simulation.timeline import DEFAULT_STEP_S, Phase, Restore, Timeli
 from touchcell.simulation.world import DeferredContact, KinematicWorld, World, computed
 
 HISTORY_S = 5.0
+_RIDE_STEPS = 100
 
 
 class ContactNotKept(TouchcellError, LookupError):
@@ -523,6 +524,18 @@ class SceneConfig(Section, SceneSection):
             return None
         height_m = 1e-3 * self.tip.radius_mm - depth_m
         return way_over(surfaces, T_world_s, direction_rad, distance_m, height_m, reach_m, back_m)
+
+    def ride(self, T_world_s: Array, reach_m: float, lasts_s: float) -> Array | None:
+        """Return the way of a contact with a surface whose motion is prescribed, as if made at the start."""
+        surfaces = [surface.build() for surface in self.surfaces.values()]
+        if self.objects or len(surfaces) != 1:
+            return None
+        met = first_contact(surfaces, T_world_s[:3, 3], T_world_s[:3, 2], 1e-3 * self.tip.radius_mm, reach_m)
+        if met is None:
+            return None
+        motion, start = surfaces[0].motion, np.append(met[0], 1.0)
+        held = se3.inverse(motion.pose(0.0)) @ start
+        return np.array([(motion.pose(t_s) @ held)[:3] for t_s in np.linspace(0.0, lasts_s, _RIDE_STEPS)])
 
     def points_over(self, T_world_s: Array, points: Array, depth_m: float, reach_m: float) -> Array | None:
         """Return the places over surfaces that stand still; None where anything moves, or nothing is touched."""

@@ -140,6 +140,42 @@ class PlannedTouch:
     depth_m: float = 0.0
 
 
+@dataclass(frozen=True, slots=True)
+class PlannedRide:
+    """A contact that goes along with what it touches.
+
+    Attributes:
+        key: of the task's parameter that says how long.
+        lasts_s: for so long.
+    """
+
+    key: Key
+    lasts_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Impossible:
+    """Something that the task cannot do.
+
+    Attributes:
+        key: of the task's parameter that asks for it.
+        why: words for it.
+        hint: remedy.
+    """
+
+    key: Key
+    why: str
+    hint: str
+
+
 PlannedMotion: TypeAlias = (
-    PlannedStart | PlannedTurn | PlannedContact | PlannedSlide | PlannedHold | PlannedTime | PlannedTouch
+    PlannedStart
+    | PlannedTurn
+    | PlannedContact
+    | PlannedSlide
+    | PlannedHold
+    | PlannedTime
+    | PlannedTouch
+    | PlannedRide
+    | Impossible
 )

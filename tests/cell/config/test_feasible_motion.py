@@ -78,7 +78,19 @@ WAYS = [
     ("surface_mesh_sim", [("interlocks.workspace.max_mm", [10, 100, 100])], "task.path", "x = 30 mm, limit 10 mm"),
     (FOLLOW, [("task.retract_mm", 140)], "task.retract_mm", "z = 1"),
 ]
+WAYS += [
+    ("object_track_sim", [("interlocks.workspace.max_mm", [30, 200, 120])], "task.duration_s", "x = .* limit 30 mm"),
+    (PUSH, [("task.target_mm", [-120, 0])], "task.target_mm", "is behind the sensor"),
+]
 TOUCHES = [
+    (FOLLOW, [("task.depth_mm", 0.05)], "task.depth_mm", "is no contact to the gate"),
+    (FOLLOW, [("task.depth_mm", 4.95)], "task.depth_mm", "known to 0.06 mm at best"),
+    (
+        FOLLOW,
+        [("sensors.sensor.estimator.gate", {"touch_percent": 0.01, "release_percent": 0.005})],
+        "sensors.sensor.estimator.gate.touch_percent",
+        "noise alone",
+    ),
     (STEPS, [("task.steps", [PRESS])], "task.steps.0.servo", "standing clear of the scene"),
     (STEPS, [("task.steps", [{"hold": {"time_s": 1}}, PRESS])], "task.steps.1.servo", "standing clear of the scene"),
     (STEPS, [("task.steps", [TOUCH, {"retract": {"distance_mm": 30}}, PRESS])], "task.steps.2.servo", "by 30 mm"),
@@ -161,6 +173,9 @@ ACCEPTED = [
     (FOLLOW, [("interlocks.limited.limit_ms", 100)]),
     (FOLLOW, [("interlocks.tcp_speed.limit_rad_s", 0.5)]),
     (FOLLOW, [("interlocks.workspace.max_mm", [110, 50, 150])]),
+    (FOLLOW, [("task.depth_mm", 4.5)]),
+    (PUSH, [("task.target_mm", [-120, 0]), ("task.goal_heading_deg", 180)]),
+    ("object_track_sim", [("task.duration_s", 1), ("interlocks.workspace.max_mm", [30, 200, 120])]),
     # A contact is felt, or the step ends, before it would trip.
     (STEPS, [("task.steps", [{"servo": {"depth_mm": 2, "until": {"time_s": 0.3}}}])]),
     (STEPS, [("task.steps", [{"servo": {"depth_mm": 2, "until": {"contact": False}}}])]),

@@ -9,12 +9,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from pydantic import BaseModel
-
+from touchcell.cell.config.demands import demands
 from touchcell.cell.config.feasible_motion import unfeasible_motions
 from touchcell.cell.config.rule_limits import is_kind, limits_of
 from touchcell.cell.config.starts import pose_of, start_of_arm
-from touchcell.cell.config.yaml_file import KeyPath, YamlFile
+from touchcell.cell.config.yaml_file import YamlFile
 from touchcell.drivers.core.arm import LimitsConfig
 from touchcell.drivers.core.scene import scene_section
 from touchcell.errors import ConfigError, suggest
@@ -22,7 +21,6 @@ from touchcell.geometry import se3
 from touchcell.geometry.errors import GeometryError
 from touchcell.input_file import BUILTIN
 from touchcell.perception.runtime.filter_spec import FILTERS, FilterConfig
-from touchcell.tasks.interface import Demand
 
 if TYPE_CHECKING:
     from touchcell.cell.config.cell_plan import CellPlan
@@ -143,7 +141,7 @@ def _depths(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
     if not limits:
         return
     rule, limit_mm = min(limits.items(), key=lambda each: each[1])
-    for key, depth_mm in _demands(plan.task_config, "depth"):
+    for key, depth_mm in demands(plan.task_config, "depth"):
         if depth_mm >= limit_mm:
             yield file.problem(
                 ("task", *key),
@@ -163,7 +161,7 @@ def _speeds(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
     rules = {
         f"interlocks.{name}.limit_m_s": 1e3 * m_s for name, m_s in limits_of(plan, "tcp_speed", "limit_m_s").items()
     }
-    for key, speed_mm_s in _demands(plan.task_config, "speed"):
+    for key, speed_mm_s in demands(plan.task_config, "speed"):
         for group, reason in ((bounds, "is more than any arm may move"), (rules, "would trip")):
             if not group:
                 continue
@@ -183,7 +181,7 @@ def _distances(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
     if not boxes:
         return
     longest_mm = max(math.dist(box.max_mm, box.min_mm) for box in boxes)
-    for key, distance_mm in _demands(plan.task_config, "distance"):
+    for key, distance_mm in demands(plan.task_config, "distance"):
         if distance_mm > longest_mm * _SLACK:
             yield file.problem(
                 ("task", *key),
@@ -252,25 +250,3 @@ def _contacts(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
             f"the tip of {name!r} is {1e3 * depth_m:.1f} mm deep in something there, but the task starts free",
             hint="start farther away",
         )
-
-
-def _demands(config: Any, quantity: str, at: KeyPath = ()) -> Iterator[tuple[KeyPath, float]]:
-    """What a task's parameters ask for, with the key of each; steps of a task are wrapped in their own names."""
-    if isinstance(config, list | tuple):
-        for index, each in enumerate(config):
-            yield from _demands(each, quantity, (*at, index, *_wrapper(each)))
-    if not isinstance(config, BaseModel):
-        return
-    for name, info in type(config).model_fields.items():
-        value = getattr(config, name)
-        demand = next((each for each in info.metadata if isinstance(each, Demand)), None)
-        if demand is None:
-            yield from _demands(value, quantity, (*at, name))
-        elif demand.quantity == quantity and value is not None:
-            numbers = value if isinstance(value, tuple) else (value,)
-            yield (*at, name), float(max(numbers) if demand.item is None else numbers[demand.item])
-
-
-def _wrapper(step: Any) -> KeyPath:
-    kind = getattr(step, "kind", None)
-    return (kind,) if isinstance(kind, str) else ()

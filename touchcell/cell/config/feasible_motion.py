@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from touchcell.cell.config.demands import demands
 from touchcell.cell.config.rule_limits import is_kind, limits_of
 from touchcell.cell.config.starts import pose_of, start_of_arm, start_of_sensor
 from touchcell.cell.config.yaml_file import KeyPath, YamlFile
@@ -16,7 +17,15 @@ from touchcell.drivers.core.scene import scene_section
 from touchcell.errors import ConfigError
 from touchcell.geometry.types import Array
 from touchcell.perception.runtime.contact_gate import CHANGE_PERCENT_PER_MM
-from touchcell.tasks.planned_motions import PlannedHold, PlannedSlide, PlannedStart, PlannedTime, PlannedTouch
+from touchcell.tasks.planned_motions import (
+    Impossible,
+    PlannedHold,
+    PlannedRide,
+    PlannedSlide,
+    PlannedStart,
+    PlannedTime,
+    PlannedTouch,
+)
 
 if TYPE_CHECKING:
     from touchcell.cell.config.cell_plan import CellPlan
@@ -25,13 +34,18 @@ if TYPE_CHECKING:
 _SLACK: Final = 1.0 + 1e-9
 _EXACTNESS_MM: Final = 1e-3
 _REACH_SLACK_M: Final = 5e-3
+_RIDE_SLACK_M: Final = 0.025
+_LEAST_TOUCH_PERCENT: Final = 0.1
+"""A quarter of a grey level."""
+_LIGHTEST: Final = 0.5
+"""Part of the depth at which a contact ends as its image says that surely is none."""
 _WAY_SLACK_MM: Final = 5.0
 """By which a way over a surface may be elsewhere: the sensor turns with the surface a little late."""
 
 
 def unfeasible_motions(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
     """Return one problem for every parameter of a task that no run could follow; the cell has no other problem."""
-    for problems in (_times, _ages, _gates, _gains, _pressing, _places, _untouched, _unmet):
+    for problems in (_impossible, _times, _ages, _gates, _too_light, _gains, _pressing, _places, _untouched, _unmet):
         yield from problems(file, plan)
 
 
@@ -109,6 +123,23 @@ def _ways(plan: CellPlan) -> Iterator[tuple[KeyPath, Array]]:
                 continue
             if way is not None:
                 yield motion.key, (way - base[:3, 3]) @ base[:3, :3]
+        elif isinstance(motion, PlannedRide):
+            way = scene.ride(base @ start @ mount, 1e-3 * reach_mm, motion.lasts_s)
+            if way is not None:
+                # The contact is made a little later, when the surface has moved on.
+                inner = (way - base[:3, 3]) @ base[:3, :3]
+                yield motion.key, inner + (inner[0] - inner) * min(1.0, _RIDE_SLACK_M / _extent(inner))
+
+
+def _extent(way_m: Array) -> float:
+    """Return how far a way (n, 3) gets from its start, or a micrometre."""
+    return max(float(np.linalg.norm(way_m - way_m[0], axis=1).max()), 1e-6)
+
+
+def _impossible(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
+    for motion in () if plan.task.motions is None else plan.task.motions(plan.task_config, *start_of_sensor(plan)):
+        if isinstance(motion, Impossible):
+            yield file.problem(("task", *motion.key), motion.why, hint=motion.hint)
 
 
 def _times(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
@@ -181,6 +212,32 @@ def _gates(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
                 value=touch_percent,
                 hint="e.g. 4",
             )
+
+
+def _too_light(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
+    """Depths that are to be held although the gate calls them no contact; and gates that any noise opens."""
+    for name in plan.sensor_roles.values():
+        gate = getattr(plan.cell.sensors[name].estimator, "gate", None)
+        touch_percent, release_percent = (getattr(gate, f"{each}_percent", None) for each in ("touch", "release"))
+        if touch_percent is None or release_percent is None:
+            continue
+        if touch_percent < _LEAST_TOUCH_PERCENT:
+            yield file.problem(
+                ("sensors", name, "estimator", "gate", "touch_percent"),
+                "less than a quarter of a grey level: noise alone would be a contact",
+                value=touch_percent,
+                hint="e.g. 4",
+            )
+        least_mm = _LIGHTEST * release_percent / CHANGE_PERCENT_PER_MM
+        for key, depth_mm in demands(plan.task_config, "depth"):
+            if key[-1] == "depth_mm" and "until" not in key and depth_mm < least_mm:
+                yield file.problem(
+                    ("task", *key),
+                    f"{depth_mm:g} mm is no contact to the gate of {name!r}, which ends it at about "
+                    f"{release_percent / CHANGE_PERCENT_PER_MM:.2g} mm",
+                    value=depth_mm,
+                    hint="press deeper",
+                )
 
 
 def _gains(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from touchcell.cell.config.armed import NotArmed
+from touchcell.cell.config.demands import demands
 from touchcell.cell.config.starts import start_of_sensor
-from touchcell.control.interlocks.basic import TcpSpeedConfig
+from touchcell.control.interlocks.basic import DepthConfig, TcpSpeedConfig
 from touchcell.control.interlocks.config import build_interlocks
 from touchcell.control.interlocks.coverage import CellFacts, SensorFacts, with_arm, with_sensor
 from touchcell.control.interlocks.snapshot import CellView
@@ -61,6 +62,8 @@ def trips_in_motion(plan: CellPlan, facts: CellFacts) -> Iterator[NotArmed]:
     for name, entry in plan.cell.interlocks.items():
         if isinstance(entry, TcpSpeedConfig):
             yield from _turns(facts, motions, name, entry)
+        if isinstance(entry, DepthConfig):
+            yield from _depths(plan, facts, name, entry)
         if entry.kind == "limited":
             shown = _starts(plan, facts, motions)
         elif isinstance(entry, UncertainConfig):
@@ -90,6 +93,15 @@ def _turns(facts: CellFacts, motions: Iterable[PlannedMotion], name: str, entry:
             )
             yield NotArmed(("interlocks", name, "limit_rad_s"), reason, "raise it, or turn less")
             return
+
+
+def _depths(plan: CellPlan, facts: CellFacts, name: str, entry: DepthConfig) -> Iterator[NotArmed]:
+    """Hold depths against the limit as they are estimated: with the least noise that the network has."""
+    sigma_mm = 1e3 * max((sensor.least_sigma_m for sensor in facts.sensors.values()), default=0.0)
+    for key, depth_mm in demands(plan.task_config, "depth"):
+        if sigma_mm and depth_mm + sigma_mm >= entry.limit_mm:
+            reason = f"{depth_mm:g} mm, known to {sigma_mm:.2g} mm at best, would trip interlocks.{name}"
+            yield NotArmed(("task", *map(str, key)), reason, f"stay well below its limit of {entry.limit_mm:g} mm")
 
 
 _Shown = Iterator[tuple[Iterable[CellView], str, str, str]]

@@ -171,6 +171,18 @@ class SceneSection(BaseModel):
         """
         return None
 
+    def ride(self, T_world_s: Array, reach_m: float, lasts_s: float) -> Array | None:
+        """Return the way (n, 3), m, of a tip that approaches along its axis and goes along with what it touches.
+
+        None where it makes no contact, or nobody knows how that moves.
+
+        Args:
+            T_world_s: (4, 4) pose of the sensor at the start.
+            reach_m: within which it makes contact.
+            lasts_s: for so long.
+        """
+        return None
+
     def points_over(self, T_world_s: Array, points: Array, depth_m: float, reach_m: float) -> Array | None:
         """Return where (n, 3), m, the tip is at points (n, 2), m, of the plane of its first contact.
 
