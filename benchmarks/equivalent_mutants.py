@@ -94,7 +94,8 @@ EQUIVALENT: Mapping[tuple[str, str, str], str] = {
     ): EXACT,
     (
         "command_checks",
-        "if twist is command.twist and t_ns is command.t_ns and ttl_s is command.ttl_s and type(command) is TwistCommand:",
+        "if twist is command.twist and t_ns is command.t_ns and ttl_s is command.ttl_s "
+        "and type(command) is TwistCommand:",
         "if -> if False",
     ): SHORTCUT,
 }

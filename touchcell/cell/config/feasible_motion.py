@@ -57,7 +57,7 @@ def _places(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
     boxes: dict[str, Any] = {rule: box for rule, box in plan.cell.interlocks.items() if is_kind(box, "workspace")}
     # A way over a known surface is known better than by the plane of the first contact.
     ways = dict(_ways(plan))
-    reported = set()
+    reported: set[KeyPath] = set()
     for key, way_m in ways.items():
         for rule, box in boxes.items():
             beyond = np.maximum(np.array(box.min_mm) - 1e3 * way_m, 1e3 * way_m - np.array(box.max_mm))
@@ -146,7 +146,8 @@ def _times(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
     """Times that are shorter than what they are for."""
     if plan.task.motions is None:
         return
-    reported, lasts_s = set(), 0.0
+    reported: set[KeyPath] = set()
+    lasts_s = 0.0
     for motion in plan.task.motions(plan.task_config, *start_of_sensor(plan)):
         if isinstance(motion, PlannedTime) and math.isfinite(motion.takes_s):
             lasts_s += motion.takes_s
@@ -262,7 +263,7 @@ def _pressing(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
     arms = (getattr(device.config, "limits", None) for device in plan.arms.values())
     accel_m_s2 = max((each.tcp_accel_m_s2 for each in arms if isinstance(each, LimitsConfig)), default=math.inf)
     latencies_ms = [float(getattr(device.config, "latency_ms", 0.0)) for device in plan.sensors.values()]
-    reported = set()
+    reported: set[KeyPath] = set()
     for motion in plan.task.motions(plan.task_config, *start_of_sensor(plan)):
         if not isinstance(motion, PlannedStart) or not motion.presses or motion.key in reported:
             continue
@@ -296,7 +297,8 @@ def _unmet(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
                 )
     if plan.task.motions is None or not plan.sensor_roles:
         return
-    name, reported = plan.sensor_roles[min(plan.sensor_roles)], set()
+    name = plan.sensor_roles[min(plan.sensor_roles)]
+    reported: set[KeyPath] = set()
     for motion in plan.task.motions(plan.task_config, *start_of_sensor(plan)):
         if not isinstance(motion, PlannedTouch) or motion.key in reported:
             continue
@@ -331,7 +333,7 @@ def _untouched(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
     arm = plan.cell.sensors[name].mounted_on
     base = None if arm is None else pose_of(plan.cell.arms[arm].base_pose_mm_deg)
     _, mount = start_of_sensor(plan)
-    reported = set()
+    reported: set[KeyPath] = set()
     for motion in plan.task.motions(plan.task_config, *start_of_sensor(plan)):
         if not isinstance(motion, PlannedHold) or motion.key in reported:
             continue
