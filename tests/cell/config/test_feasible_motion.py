@@ -150,7 +150,6 @@ TIMES = [
     (FOLLOW, [("task.settle_timeout_s", 0.2)], "task.settle_timeout_s", "0.3 s at least to settle"),
     (FOLLOW, [("task.prepare_timeout_s", 0.1)], "task.prepare_timeout_s", "0.2 s at least to back off"),
     (PUSH, [("task.push_timeout_s", 1)], "task.push_timeout_s", "at least to push so far"),
-    (FOLLOW, [("max_duration_s", 5)], "max_duration_s", "takes 9.5 s at least"),
     (FOLLOW, [("task.max_frame_age_ms", 15)], "task.max_frame_age_ms", "come after 10 ms"),
     (FOLLOW, [("task.kp_per_s", [0, 0, 300, 8, 8, 0])], "task.kp_per_s", "overshoots by more than the error"),
     (FOLLOW, [("task.kp_per_s", [0, 0, -8, 8, 8, 0])], "task.kp_per_s.2", "greater than or equal to 0"),
@@ -174,6 +173,8 @@ ACCEPTED = [
     (FOLLOW, [("interlocks.tcp_speed.limit_rad_s", 0.5)]),
     (FOLLOW, [("interlocks.workspace.max_mm", [110, 50, 150])]),
     (FOLLOW, [("task.depth_mm", 4.5)]),
+    # A run may be ended before its task is.
+    (FOLLOW, [("max_duration_s", 5)]),
     (PUSH, [("task.target_mm", [-120, 0]), ("task.goal_heading_deg", 180)]),
     ("object_track_sim", [("task.duration_s", 1), ("interlocks.workspace.max_mm", [30, 200, 120])]),
     # A contact is felt, or the step ends, before it would trip.

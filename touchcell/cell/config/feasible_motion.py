@@ -147,12 +147,7 @@ def _times(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
     if plan.task.motions is None:
         return
     reported: set[KeyPath] = set()
-    lasts_s = 0.0
     for motion in plan.task.motions(plan.task_config, *start_of_sensor(plan)):
-        if isinstance(motion, PlannedTime) and math.isfinite(motion.takes_s):
-            lasts_s += motion.takes_s
-        elif isinstance(motion, PlannedSlide) and motion.known:
-            lasts_s += motion.distance_m / motion.speed_m_s
         if (
             isinstance(motion, PlannedTime)
             and not (motion.by_model and not _has_model(plan))
@@ -167,14 +162,6 @@ def _times(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
                 value=motion.allowed_s,
                 hint="allow more time, go faster, or go less far",
             )
-
-    if lasts_s > plan.cell.max_duration_s * _SLACK and not reported:
-        yield file.problem(
-            ("max_duration_s",),
-            f"a run ends after {plan.cell.max_duration_s:g} s, and this task takes {lasts_s:.3g} s at least",
-            value=plan.cell.max_duration_s,
-            hint="allow more time, go faster, or go less far",
-        )
 
 
 def _has_model(plan: CellPlan) -> bool:
