@@ -14,8 +14,8 @@ def sway(data: dict[str, Any]) -> dict[str, Any]:
     return data
 
 
-def run_into_the_wall(data: dict[str, Any]) -> dict[str, Any]:
-    """End the workspace of ``surface_follow_sim`` 8 mm after its start, and its way later; returns the changed cell."""
+def run_into_the_wall(data: dict[str, Any]) -> None:
+    """End the workspace of ``surface_follow_sim`` 8 mm after its start, and its way later."""
     data["interlocks"]["workspace"]["max_mm"] = [-72, 50, 150]
     data["task"]["distance_mm"] = 30
-    return sway(data)
+    sway(data)
