@@ -249,3 +249,14 @@ def test_devices_are_given_two_seconds_and_only_once() -> None:
     asked = len(table.asked_ns)
     bench.procedure.await_rest()
     assert len(table.asked_ns) == asked
+
+
+def test_a_device_that_comes_to_rest_in_time_is_no_fault() -> None:
+    table = Turntable(VirtualClock(), 1.5)
+    bench = Bench({"rest_s": lambda category: 0.0}, {"table": table})
+    table._clock = bench.clock
+    began_ns = bench.clock.now_ns()
+    bench.stopped()
+    assert bench.clock.now_ns() - began_ns == 1_500_000_000
+    assert bench.events == []
+    assert not bench.latch.causes
