@@ -82,6 +82,22 @@ EQUIVALENT: Mapping[tuple[str, str, str], str] = {
     ): EXACT,
     ("collision", "best = np.where(slope[:, -1] < 0.0, 1.0, best)", "Lt -> LtE"): EXACT,
     ("rest", "_MOST_SEEN: Final = 1000", "1000 -> 2000"): "only bounds the memory",
+    (
+        "rest",
+        "moved = np.array([np.linalg.norm(extent[:3, 3]), np.linalg.norm(extent[:3, :3]) / np.sqrt(2.0)])",
+        "3 -> 6",
+    ): "the last row of a pose never changes, so that it adds nothing to an extent",
+    (
+        "rest",
+        "return bool((moved <= self._rest * 1e-9 * lasted_ns).all() and (speeds[-1] <= 2.0 * usual).all())",
+        "LtE -> Lt",
+    ): EXACT,
+    (
+        "command_checks",
+        "if twist is command.twist and t_ns is command.t_ns and ttl_s is command.ttl_s "
+        "and type(command) is TwistCommand:",
+        "if -> if False",
+    ): SHORTCUT,
 }
 """Reason by module, line of source without its indentation, and change."""
 

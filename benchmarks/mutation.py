@@ -1,6 +1,6 @@
 """Mutation score of the safety code: small changes to it, one at a time, that some test has to notice.
 
-    python -m benchmarks mutation [--of gate,latch,...] [--most N] [--seed S]
+    python -m benchmarks mutation [--of gate,latch,...] [--most N] [--seed S] [--tests FILE,...]
 
 Each mutant changes one operator, comparison, constant, condition or statement of a module. The tests that are about
 the modules are collected once. A first pass notes which functions of the module each of them calls and how long it
@@ -535,12 +535,14 @@ def run(arguments: Sequence[str], out: Path) -> None:
     )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--timeout", type=float, default=60.0, help="seconds of CPU for the tests of one mutant")
+    parser.add_argument("--tests", default="", help="files to take in place of all tests about the modules, by comma")
     options = parser.parse_args(arguments)
     started = time.monotonic()
     out = out.absolute()
     os.chdir(CHECKOUT)
     trials = _Trials(options)
-    tests = dict.fromkeys(test for name in options.of.split(",") for test in MODULES[name][1])
+    about = dict.fromkeys(test for name in options.of.split(",") for test in MODULES[name][1])
+    tests = options.tests.split(",") if options.tests else about
     pytest.main([*_OPTIONS, "-s", *tests], plugins=[trials])
     if trials.failed:
         raise SystemExit(f"fail without any mutation: {', '.join(trials.failed)}")

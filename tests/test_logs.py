@@ -62,7 +62,7 @@ def test_a_refused_command_is_logged_once_until_one_is_accepted(caplog: pytest.L
 
 
 def test_a_run_writes_its_log(tmp_path: Path) -> None:
-    cell = tc.load_cell("surface_follow_sim", set={"interlocks.uncertain.limit_mm": 0.01})
+    cell = tc.load_cell("surface_follow_sim", set={"interlocks.uncertain.limit_mm": 0.07})
     run = tc.run(cell, out=tmp_path / "run")
     assert run.outcome == "tripped"
     log = (run.folder / LOG).read_text()

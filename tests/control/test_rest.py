@@ -110,6 +110,32 @@ def test_positions_count_from_one_end_to_the_other_and_not_from_the_first() -> N
     assert not along(to_and_fro)
 
 
+def test_a_state_is_of_now_until_it_is_as_old_as_the_window() -> None:
+    assert judged([view(0, standing(0), (0,) * 6, age_ns=WINDOW_NS)])
+
+
+def test_a_position_counts_for_as_long_as_the_window() -> None:
+    place = moved(0, 50.0, since_ns=CYCLE_NS)
+    assert not along(place, range(0, WINDOW_NS + 1, CYCLE_NS))
+    assert along(place, range(0, WINDOW_NS + CYCLE_NS + 1, CYCLE_NS))
+
+
+def test_a_shift_is_no_turn() -> None:
+    monitor = RestMonitor(1.0, 1e-2)
+    for t_ns in range(0, 600_000_000, CYCLE_NS):
+        now = view(t_ns, moved(0, 100.0)(t_ns))
+        monitor.note(now)
+    assert monitor.at_rest(now)
+
+
+def test_a_motion_that_begins_is_not_hidden_by_the_noise_of_turning_about_the_same_axis() -> None:
+    noise = (0.006, 0, 0, 0.02, 0, 0)
+    faster = (0.0126, 0, 0, 0.02, 0, 0)
+    times_ns = range(0, 600_000_001, CYCLE_NS)
+    assert judged(view(t_ns, standing(t_ns), noise) for t_ns in times_ns)
+    assert not judged(view(t_ns, standing(t_ns), faster if t_ns > 550_000_000 else noise) for t_ns in times_ns)
+
+
 def test_a_motion_that_is_over_counts_until_it_is_half_a_second_ago() -> None:
     place = moved(0, 50.0, since_ns=300_000_000)
     assert not along(place, range(0, 300_000_000 + STOOD_FOR_NS, CYCLE_NS))
@@ -161,7 +187,7 @@ def test_a_speed_above_what_it_measured_while_it_stood_is_a_motion_that_has_begu
     )
 
 
-@pytest.mark.parametrize(("begun_ms", "at_rest"), [(50, False), (95, False), (150, True)])
+@pytest.mark.parametrize(("begun_ms", "at_rest"), [(50, False), (95, False), (100, False), (101, True), (150, True)])
 def test_what_is_measured_for_a_tenth_of_a_second_while_the_positions_stay_is_usual(
     begun_ms: int, at_rest: bool
 ) -> None:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 import numpy as np
 
+from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 from touchcell.simulation.surfaces import Surface
 
@@ -15,6 +16,8 @@ _TOUCHING_M: Final = 0.05e-3
 _MOST_STEPS: Final = 500
 _LONGEST_STEP: Final = 0.25
 _STEEP_RAD: Final = math.radians(20.0)
+_STEP_M: Final = 4e-3
+_TINY: Final = 1e-12
 _FAR: Final = 4.0
 """How much further than the reach is searched, to say how far away the surface is."""
 
@@ -48,6 +51,86 @@ def remark_on_approach(
         f"no surface lies ahead of the tip; it would pass {closest[1]} at {1e3 * closest[0]:.0f} mm, "
         f"whose nearest point is ({at}) mm"
     )
+
+
+def way_over(
+    surfaces: Sequence[Surface],
+    T_world_s: Array,
+    direction_rad: float,
+    distance_m: float,
+    height_m: float,
+    reach_m: float,
+    back_m: float,
+) -> Array | None:
+    """Return the way (n, 3), m, of a tip's centre that touches surfaces and goes straight over them, normal to them.
+
+    Args:
+        surfaces: that stand still.
+        T_world_s: (4, 4) pose of the sensor, from which it moves along its z axis.
+        direction_rad: of the way, from the sensor's x axis towards its y axis.
+        distance_m: length of the way.
+        height_m: of the tip's centre over the surface in contact.
+        reach_m: distance within which it has to make contact.
+        back_m: how far it withdraws at the end, along the last normal; that is the last row.
+    """
+    met = first_contact(surfaces, T_world_s[:3, 3], T_world_s[:3, 2], height_m, reach_m)
+    if met is None:
+        return None
+    centre, normal = met
+    named = {str(k): surface for k, surface in enumerate(surfaces)}
+    forward = T_world_s[:3, :2] @ np.array([math.cos(direction_rad), math.sin(direction_rad)])
+    way, steps = [centre], max(1, min(_MOST_STEPS, math.ceil(distance_m / _STEP_M)))
+    for _ in range(steps):
+        forward = forward - float(forward @ normal) * normal
+        forward = forward / max(float(np.linalg.norm(forward)), _TINY)
+        centre = centre + distance_m / steps * forward
+        gap_m, _, normal, _ = _nearest(named, centre, height_m)
+        centre = centre - gap_m * normal
+        way.append(centre)
+    way.append(centre + back_m * normal)
+    return np.array(way)
+
+
+def points_over(
+    surfaces: Sequence[Surface], T_world_s: Array, points: Array, height_m: float, reach_m: float
+) -> Array | None:
+    """Return where (n, 3), m, a tip's centre is at points (n, 2), m, of the plane in which its contact settles.
+
+    The arguments are those of ``way_over``. Where nothing is below a point, the place in the plane is returned.
+    """
+    met = first_contact(surfaces, T_world_s[:3, 3], T_world_s[:3, 2], height_m, reach_m)
+    if met is None:
+        return None
+    origin, normal = met
+    # The sensor turns to the surface by the smallest rotation.
+    turn = np.cross(T_world_s[:3, 2], -normal)
+    R = T_world_s[:3, :3]
+    if (sin := float(np.linalg.norm(turn))) > _TINY:
+        angle = math.atan2(sin, -float(normal @ T_world_s[:3, 2]))
+        R = se3.exp(np.concatenate([np.zeros(3), angle / sin * turn]))[:3, :3] @ R
+    found = []
+    for x, y in points:
+        place = origin + R[:, :2] @ np.array([x, y])
+        above = place - reach_m * R[:, 2]
+        below = first_contact(surfaces, above, R[:, 2], height_m, 2.0 * reach_m)
+        found.append(place if below is None else below[0])
+    return np.array(found)
+
+
+def first_contact(
+    surfaces: Sequence[Surface], start: Array, axis: Array, height_m: float, reach_m: float
+) -> tuple[Array, Array] | None:
+    """Return where (3,) a tip's centre that goes along an axis (3,) is at its height over a surface, and the normal."""
+    named, travelled_m = {str(k): surface for k, surface in enumerate(surfaces)}, 0.0
+    for _ in range(_MOST_STEPS):
+        centre = start + travelled_m * axis
+        gap_m, _, normal, _ = _nearest(named, centre, height_m)
+        if gap_m <= _TOUCHING_M:
+            return centre, normal
+        travelled_m += gap_m
+        if travelled_m > reach_m:
+            break
+    return None
 
 
 def _remark_on_contact(name: str, travelled_m: float, cos_tilt: float, reach_m: float) -> str | None:

@@ -165,6 +165,11 @@ class QuasiStaticWorld:
         self._models: dict[str, ContactModel] = {}
         self._t_s = 0.0
 
+    @property
+    def bodies(self) -> list[Surface]:
+        """Objects and surfaces, where they are now."""
+        return self._bodies
+
     def mount(self, sensor: str, T_world_s: Array, t_s: float) -> ContactState:
         """Add ``sensor``; return its contact at ``T_world_s`` (4, 4) at ``t_s``."""
         self._t_s = t_s

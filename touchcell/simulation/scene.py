@@ -21,11 +21,12 @@ from touchcell.errors import ConfigError, TouchcellError
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 from touchcell.plugin_section import Section
-from touchcell.simulation.ahead import remark_on_approach
+from touchcell.simulation.ahead import first_contact, points_over, remark_on_approach, way_over
 from touchcell.simulation.bodies import scene_bodies
 from touchcell.simulation.closed_forms import Box, Cylinder, Saddle
 from touchcell.simulation.contact import ContactLaw
 from touchcell.simulation.edges import nearest_edge
+from touchcell.simulation.motions import Still
 from touchcell.simulation.objects import ObjectConfig, TableConfig
 from touchcell.simulation.quasi_static import QuasiStaticWorld
 from touchcell.simulation.relief import felt_relief
@@ -35,6 +36,7 @@ from touchcell.simulation.timeline import DEFAULT_STEP_S, Phase, Restore, Timeli
 from touchcell.simulation.world import DeferredContact, KinematicWorld, World, computed
 
 HISTORY_S = 5.0
+_RIDE_STEPS = 100
 
 
 class ContactNotKept(TouchcellError, LookupError):
@@ -487,6 +489,60 @@ class SceneConfig(Section, SceneSection):
         depths_m = {sensor: float(scene.contact(sensor).value.T_f_s[2, 3]) for sensor in tips}
         return {sensor: depth_m for sensor, depth_m in depths_m.items() if depth_m > 0.0}
 
+    def touches(self, T_world_s: Array) -> bool:
+        """Return whether a tip at a pose (4, 4) touches a surface; True where anything moves."""
+        radius_m, surfaces = 1e-3 * self.tip.radius_mm, self._still()
+        near = (surface.nearest(T_world_s[:3, 3], 0.0).distance_m < radius_m for surface in surfaces)
+        return not surfaces or any(near)
+
+    def meets(self, T_world_s: Array, way_m: Array, depth_m: float = 0.0) -> bool:
+        """Return whether a surface or an object is in the way of a tip; True where any moves by itself."""
+        surfaces = {name: surface.build() for name, surface in self.surfaces.items()}
+        if self.physics == "dynamic" or not all(isinstance(surface.motion, Still) for surface in surfaces.values()):
+            return True
+        bodies = list(surfaces.values())
+        if isinstance(world := self._world(surfaces), QuasiStaticWorld):
+            bodies = world.bodies
+        length_m, height_m = float(np.linalg.norm(way_m)), 1e-3 * self.tip.radius_mm - depth_m
+        return first_contact(bodies, T_world_s[:3, 3], way_m / max(length_m, 1e-9), height_m, length_m) is not None
+
+    def most_shear_m(self, depth_m: float) -> float | None:
+        """Return the shear with which a contact of a depth slides."""
+        return self.tip.build().max_shear_m(depth_m)
+
+    def way_over(
+        self,
+        T_world_s: Array,
+        direction_rad: float,
+        distance_m: float,
+        depth_m: float,
+        reach_m: float,
+        back_m: float,
+    ) -> Array | None:
+        """Return the way over surfaces that stand still; None where anything moves, or nothing is touched."""
+        if not (surfaces := self._still()):
+            return None
+        height_m = 1e-3 * self.tip.radius_mm - depth_m
+        return way_over(surfaces, T_world_s, direction_rad, distance_m, height_m, reach_m, back_m)
+
+    def ride(self, T_world_s: Array, reach_m: float, lasts_s: float) -> Array | None:
+        """Return the way of a contact with a surface whose motion is prescribed, as if made at the start."""
+        surfaces = [surface.build() for surface in self.surfaces.values()]
+        if self.objects or len(surfaces) != 1:
+            return None
+        met = first_contact(surfaces, T_world_s[:3, 3], T_world_s[:3, 2], 1e-3 * self.tip.radius_mm, reach_m)
+        if met is None:
+            return None
+        motion, start = surfaces[0].motion, np.append(met[0], 1.0)
+        held = se3.inverse(motion.pose(0.0)) @ start
+        return np.array([(motion.pose(t_s) @ held)[:3] for t_s in np.linspace(0.0, lasts_s, _RIDE_STEPS)])
+
+    def points_over(self, T_world_s: Array, points: Array, depth_m: float, reach_m: float) -> Array | None:
+        """Return the places over surfaces that stand still; None where anything moves, or nothing is touched."""
+        if not (surfaces := self._still()):
+            return None
+        return points_over(surfaces, T_world_s, points, 1e-3 * self.tip.radius_mm - depth_m, reach_m)
+
     def has_edges(self) -> bool:
         """Return whether a surface has an edge."""
         surfaces = [surface.build() for surface in self.surfaces.values()]
@@ -505,6 +561,12 @@ class SceneConfig(Section, SceneSection):
         for sensor, T_world_s in starts.items():
             if ahead := remark_on_approach(surfaces, T_world_s, radius_m, reach_m):
                 yield f"sensors.{sensor}: {ahead}"
+
+    def _still(self) -> Sequence[Surface]:
+        """Return the surfaces of a scene in which nothing moves; none of any other."""
+        surfaces = [surface.build() for surface in self.surfaces.values()]
+        moves = self.objects or not all(isinstance(surface.motion, Still) for surface in surfaces)
+        return () if moves else surfaces
 
     def _world(self, surfaces: Mapping[str, Surface]) -> World:
         if self.physics == "kinematic":

@@ -116,7 +116,12 @@ class Easing(Protocol):
 Six = tuple[float, float, float, float, float, float]
 """One number for each of x, y, z, alpha, beta, gamma."""
 
-SixGains = Annotated[Six, Field(description="x, y, z, alpha, beta, gamma of the sensor's twist; zeros: not controlled")]
+_Gain = Annotated[float, Field(ge=0.0)]
+
+SixGains = Annotated[
+    tuple[_Gain, _Gain, _Gain, _Gain, _Gain, _Gain],
+    Field(description="x, y, z, alpha, beta, gamma of the sensor's twist; zeros: not controlled"),
+]
 
 
 class ContactServoConfig(TaskConfig):

@@ -10,7 +10,7 @@ sequence begins with frames out of contact, whose depth is negative.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum, auto
 from typing import Annotated, Literal
@@ -37,11 +37,14 @@ from touchcell.tasks.interface import (
     TaskSpec,
     TransitionRecord,
 )
+from touchcell.tasks.planned_motions import PlannedContact, PlannedMotion, PlannedStart
 from touchcell.tasks.servoing import ARM, SENSOR
 from touchcell.tasks.state_machine import FAULT, STOP, TRIP, StateDef, Table, TaskMachine, TransitionDef
 from touchcell.tasks.state_machine_task import MachineTask
 
 _GAIN_PER_S = 10.0
+_MANY = 20
+"""Samples of which one is sheared by most of what is allowed."""
 _WITHIN_M, _WITHIN_RAD = 2e-5, 5e-4
 
 
@@ -375,6 +378,15 @@ class DataCollection(MachineTask):
         return (self._in_air if state is CollectState.TILT else self._in_contact).twist(T_base_s, self._goal)
 
 
+def _motions(config: DataCollectionConfig) -> Iterator[PlannedMotion]:
+    """Return how each press begins, and the largest of many shears."""
+    way_mm = config.clearance_mm + config.depth_mm[0]
+    speed_mm_s = min(config.press_speed_mm_s, _GAIN_PER_S * way_mm)
+    yield PlannedStart(("press_speed_mm_s",), 1e-3 * speed_mm_s, 1e-3 * way_mm - 1e-3 * speed_mm_s / _GAIN_PER_S)
+    if config.samples >= _MANY:
+        yield PlannedContact(("shear_mm",), 1e-3 * config.settle_ms, "grab", 1e-3 * config.shear_mm)
+
+
 SPEC = TaskSpec(
     name="data_collection",
     summary="touch a known surface with varied contacts and store labelled frames",
@@ -383,4 +395,5 @@ SPEC = TaskSpec(
     sensors=frozenset({SENSOR}),
     build=DataCollection,
     labels_frames=True,
+    motions=lambda config, start, mount: _motions(config),
 )

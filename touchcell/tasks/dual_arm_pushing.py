@@ -20,7 +20,7 @@ from touchcell.tasks.contact_servo import ContactServo, ContactServoConfig, Six,
 from touchcell.tasks.free_motion import Goal, heading_of, placed
 from touchcell.tasks.interface import CONTACT_DEPTH, TaskContext, TaskSpec
 from touchcell.tasks.predictive_push import PredictivePush, twist_in_sensor
-from touchcell.tasks.servoing import ServoConfig, ServoTask
+from touchcell.tasks.servoing import ServoConfig, ServoTask, servo_motions
 from touchcell.tasks.single_arm_pushing import Push, PushConfig
 
 LEADER: Final = "leader"
@@ -208,4 +208,5 @@ SPEC = TaskSpec(
     build=build,
     starts_free=True,
     places=lambda config, start, mount: config.planned_places(LEADER),
+    motions=lambda config, start, mount: servo_motions(config),
 )

@@ -21,7 +21,7 @@ from touchcell.perception.features.feature_model import TouchedFeature
 from touchcell.perception.runtime.feature_spec import EDGE
 from touchcell.tasks.contact_servo import ContactServo, SixGains
 from touchcell.tasks.interface import DEPTH, SPEED, TaskContext, TaskSpec
-from touchcell.tasks.servoing import ARM, SENSOR, ServoConfig, ServoTask
+from touchcell.tasks.servoing import ARM, SENSOR, ServoConfig, ServoTask, servo_motions
 
 _AXES: Final = {
     2: (True, True, False, False, False, True),
@@ -195,4 +195,5 @@ SPEC = TaskSpec(
     _build,
     starts_free=True,
     feature=EDGE.name,
+    motions=lambda config, start, mount: servo_motions(config, shears=False),
 )

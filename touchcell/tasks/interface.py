@@ -20,6 +20,7 @@ from touchcell.geometry.types import Array
 from touchcell.perception.runtime.estimate import ContactEstimate
 from touchcell.perception.runtime.estimator_spec import Feature
 from touchcell.registry import Registry
+from touchcell.tasks.planned_motions import PlannedMotion
 from touchcell.tasks.planned_places import PlannedPlace
 
 
@@ -194,6 +195,7 @@ class TaskSpec(Generic[TaskConfigT]):
             must provide WrenchSource.
         places: returns where a configuration surely takes an arm, for `touchcell check`, given the pose (4, 4) at which
             the sensor's arm starts, None if that is not known, and the sensor's mount (4, 4).
+        motions: returns what a configuration surely does, likewise.
         starts_free: True if its sensors must not touch anything when it begins.
         feature: what the contacts of its sensors must be of; None for a task to which it is the same.
         of_cell: returns the spec with the roles of a cell, for a task whose arms and sensors are those that the cell
@@ -211,6 +213,7 @@ class TaskSpec(Generic[TaskConfigT]):
     forces: Callable[[TaskConfigT], Mapping[str, str]] | None = None
     starts_free: bool = False
     places: Callable[[TaskConfigT, Array | None, Array], Iterable[PlannedPlace]] | None = None
+    motions: Callable[[TaskConfigT, Array | None, Array], Iterable[PlannedMotion]] | None = None
     feature: Feature | None = "surface"
     of_cell: Callable[[frozenset[str], frozenset[str]], TaskSpec[TaskConfigT]] | None = None
 

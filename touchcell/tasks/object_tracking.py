@@ -11,7 +11,8 @@ from pydantic import PositiveFloat
 from touchcell.geometry.types import Array
 from touchcell.tasks.contact_servo import SixGains
 from touchcell.tasks.interface import DEPTH
-from touchcell.tasks.servoing import ServoConfig, one_arm_task
+from touchcell.tasks.planned_motions import PlannedRide
+from touchcell.tasks.servoing import ServoConfig, one_arm_task, servo_motions
 
 
 class ObjectTrackingConfig(ServoConfig):
@@ -67,4 +68,5 @@ SPEC = one_arm_task(
     ObjectTrackingConfig,
     Track,
     lambda config: (0.0, 0.0, config.depth_mm, 0.0, 0.0, 0.0),
+    motions=lambda config, start, mount: (*servo_motions(config), PlannedRide(("duration_s",), config.duration_s)),
 )

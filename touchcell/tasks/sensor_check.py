@@ -38,6 +38,7 @@ _BACK_PER_S = 10.0
 _BACK_PER_S2 = 25.0
 _MOST_DRAG_M_S = 2e-3
 _BACK_S = 0.2
+_SHARES = (0.95, 0.75, 0.5, 0.25)
 _BEHIND_M, _BEHIND_RAD = 0.1e-3, math.radians(0.2)
 # By proportional control of a measurement that is a frame old and more.
 _DEPTH_PER_S = 5.0
@@ -234,6 +235,17 @@ class SensorCheck:
                 0.0,
             ]
         )
+
+
+def sheared_for(duration_s: float, shift_mm: float) -> list[tuple[float, float]]:
+    """Return shears that a check of a duration reaches, mm, each with how long its first shift exceeds it, s."""
+    pulse_s = 0.5 * (1.0 - _PRESS_SHARE) * duration_s
+    return [(share * shift_mm, pulse_s * (1.0 - math.acos(1.0 - 2.0 * share) / math.pi)) for share in _SHARES]
+
+
+def turned_at(duration_s: float, tilt_deg: float) -> float:
+    """Return the fastest tilting of a check of a duration, deg/s."""
+    return math.pi * tilt_deg / (0.5 * (1.0 - _PRESS_SHARE) * duration_s)
 
 
 def _pulse(t: float) -> float:

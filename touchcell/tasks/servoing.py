@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from enum import Enum, auto
 from typing import Annotated, Final, TypeVar
 
@@ -14,9 +15,19 @@ from touchcell.drivers.core.protocols import SERVO_ARM
 from touchcell.errors import TouchcellError
 from touchcell.geometry.types import Array
 from touchcell.tasks.contact_servo import Behavior, ContactServo, ContactServoConfig, Six
-from touchcell.tasks.interface import SPEED, Action, Observation, TaskContext, TaskSpec, TransitionRecord
+from touchcell.tasks.interface import (
+    DEPTH,
+    DISTANCE,
+    SPEED,
+    Action,
+    Observation,
+    TaskContext,
+    TaskSpec,
+    TransitionRecord,
+)
+from touchcell.tasks.planned_motions import PlannedContact, PlannedMotion, PlannedStart, PlannedTime, PlannedTurn
 from touchcell.tasks.planned_places import PlannedPlace
-from touchcell.tasks.sensor_check import SensorCheck
+from touchcell.tasks.sensor_check import SensorCheck, sheared_for, turned_at
 from touchcell.tasks.state_machine import FAULT, STOP, TRIP, StateDef, Table, TaskMachine, TransitionDef, state_name
 from touchcell.tasks.state_machine_task import MachineTask
 
@@ -24,6 +35,8 @@ ARM: Final = "arm"
 """Role of the arm in tasks with one arm."""
 SENSOR: Final = "sensor"
 """Role of the tactile sensor that it carries."""
+CHECKING: Final = "check"
+"""State in which a model's estimates are checked; one that has no model is not in it."""
 _SIDESTEP_S: Final = 30.0
 """Longest motion beside an object; six touches of an edge take 15 s."""
 _RETURN_S: Final = 10.0
@@ -72,12 +85,12 @@ class ServoConfig(ContactServoConfig):
     approach_speed_mm_s: Annotated[PositiveFloat, SPEED] = 10.0
     approach_distance_mm: PositiveFloat = 50.0
     check_s: NonNegativeFloat = 1.0
-    check_press_mm: NonNegativeFloat = 0.5
+    check_press_mm: Annotated[NonNegativeFloat, DEPTH] = 0.5
     check_shift_mm: PositiveFloat = 0.3
     check_tilt_deg: PositiveFloat = 1.0
     settle_time_s: NonNegativeFloat = 0.3
     settle_timeout_s: PositiveFloat = 10.0
-    retract_mm: PositiveFloat = 20.0
+    retract_mm: Annotated[PositiveFloat, DISTANCE] = 20.0
     retract_speed_mm_s: Annotated[PositiveFloat, SPEED] = 20.0
     sidestep_speed_mm_s: Annotated[PositiveFloat, SPEED] = 20.0
     return_lift_mm: PositiveFloat | None = None
@@ -557,6 +570,32 @@ class ServoTask(MachineTask):
         return telemetry
 
 
+def servo_motions(config: ServoConfig, *, shears: bool = True) -> Iterator[PlannedMotion]:
+    """Return what every servoing task surely does: it approaches, is checked, settles and retracts.
+
+    Args:
+        config: parameters of the task.
+        shears: False where a shift of the sensor is no shear, as along an edge.
+    """
+    # A sensor with images backs off at the speed of the approach, and has that way ahead of it at least.
+    yield PlannedStart(
+        ("approach_speed_mm_s",),
+        1e-3 * config.approach_speed_mm_s,
+        1e-3 * min(config.back_off_mm, config.retract_mm),
+        presses=True,
+    )
+    yield PlannedStart(("retract_speed_mm_s",), 1e-3 * config.retract_speed_mm_s, 1e-3 * config.retract_mm)
+    back_off_s = config.back_off_mm / config.approach_speed_mm_s
+    yield PlannedTime(("prepare_timeout_s",), back_off_s, config.prepare_timeout_s, "to back off", by_model=True)
+    yield PlannedContact(("settle_time_s",), config.settle_time_s, "settle")
+    yield PlannedTime(("settle_timeout_s",), config.settle_time_s, config.settle_timeout_s, "to settle")
+    if config.check_s > 0.0:
+        for shear_mm, lasts_s in sheared_for(config.check_s, config.check_shift_mm) if shears else ():
+            yield PlannedContact(("check_shift_mm",), lasts_s, CHECKING, 1e-3 * shear_mm)
+        yield PlannedContact(("check_s",), config.check_s, CHECKING)
+        yield PlannedTurn(("check_tilt_deg",), math.radians(turned_at(config.check_s, config.check_tilt_deg)), CHECKING)
+
+
 ServoConfigT = TypeVar("ServoConfigT", bound=ServoConfig)
 
 
@@ -567,6 +606,7 @@ def one_arm_task(
     behavior: Callable[[ServoConfigT], Behavior],
     reference_mm_deg: Callable[[ServoConfigT], Six],
     places: Callable[[ServoConfigT, Array | None, Array], Iterable[PlannedPlace]] | None = None,
+    motions: Callable[[ServoConfigT, Array | None, Array], Iterable[PlannedMotion]] | None = None,
 ) -> TaskSpec[ServoConfigT]:
     """Return the spec of a task in which ``arm`` holds a contact with ``sensor`` and runs one behavior.
 
@@ -577,6 +617,7 @@ def one_arm_task(
         behavior: creates the behavior from the parameters.
         reference_mm_deg: returns the contact to hold, Euler components of ``T_f_s``.
         places: of its ``TaskSpec``.
+        motions: of its ``TaskSpec``; None for what every servoing task does.
     """
 
     def build(config: ServoConfigT, context: TaskContext) -> ServoTask:
@@ -584,5 +625,13 @@ def one_arm_task(
         return ServoTask(name, config, context, servo)
 
     return TaskSpec(
-        name, summary, config, {ARM: SERVO_ARM}, frozenset({SENSOR}), build, starts_free=True, places=places
+        name,
+        summary,
+        config,
+        {ARM: SERVO_ARM},
+        frozenset({SENSOR}),
+        build,
+        starts_free=True,
+        places=places,
+        motions=motions or (lambda config, start, mount: servo_motions(config)),
     )

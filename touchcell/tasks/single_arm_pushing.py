@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Annotated, ClassVar, Literal, Self
+from typing import Annotated, ClassVar, Final, Literal, Self
 
 import numpy as np
 from pydantic import NonNegativeFloat, PositiveFloat, model_validator
@@ -15,10 +15,11 @@ from touchcell.geometry.types import Array
 from touchcell.tasks.contact_servo import ContactServoConfig, Six, SixGains
 from touchcell.tasks.free_motion import Goal
 from touchcell.tasks.interface import SPEED
+from touchcell.tasks.planned_motions import Impossible, PlannedMotion, PlannedTime
 from touchcell.tasks.planned_places import PlannedPlace
 from touchcell.tasks.predictive_push import PredictivePush, PredictivePushSettings, Progress, twist_in_sensor
 from touchcell.tasks.push_path import Obstacle, plan
-from touchcell.tasks.servoing import ARM, ServoConfig, one_arm_task
+from touchcell.tasks.servoing import ARM, ServoConfig, one_arm_task, servo_motions
 
 Mm = tuple[float, float]
 _SIGMAS = 2.0
@@ -334,6 +335,28 @@ def _aim_of(progress: Progress) -> Aim:
     )
 
 
+_BEHIND: Final = 0.5
+"""Cosine from which on a target is so far behind that no push turns round to it."""
+
+
+def _motions(config: SingleArmPushingConfig, T_base_tcp: Array | None, T_tcp_sensor: Array) -> Iterator[PlannedMotion]:
+    """Return how long the push takes at least, from where an approach may have made contact, besides the rest."""
+    yield from servo_motions(config)
+    if T_base_tcp is None:
+        return
+    T_base_sensor = T_base_tcp @ T_tcp_sensor
+    tip_mm = 1e3 * T_base_sensor[:2, 3]
+    ahead_mm = float(T_base_sensor[:2, 2] @ (np.array(config.target_mm) - tip_mm))
+    planned = config.path_mm or config.obstacles_mm or config.goal_heading_deg is not None
+    if not planned and ahead_mm < -_BEHIND * math.dist(tip_mm, config.target_mm):
+        why = "is behind the sensor, which can only push away from itself"
+        yield Impossible(("target_mm",), why, "start on the other side of the object")
+    way_mm = math.dist(tip_mm, config.target_mm) - config.approach_distance_mm
+    way_mm -= config.object_center_offset_mm + config.arrival_tolerance_mm
+    takes_s = max(way_mm, 0.0) / config.push_speed_mm_s
+    yield PlannedTime(("push_timeout_s",), takes_s, config.push_timeout_s, "to push so far")
+
+
 SPEC = one_arm_task(
     "single_arm_pushing",
     "push an object over a table to a target, steering it by touch",
@@ -341,4 +364,5 @@ SPEC = one_arm_task(
     Push,
     lambda config: config.reference_mm_deg,
     lambda config, start, mount: config.planned_places(ARM),
+    _motions,
 )

@@ -12,12 +12,14 @@ from typing import Annotated
 import numpy as np
 from pydantic import PositiveFloat
 
+from touchcell.control.path import Point
 from touchcell.geometry.types import Array
 from touchcell.tasks.contact_servo import SixGains
 from touchcell.tasks.felt_curvature import CurvedWay
 from touchcell.tasks.interface import DEPTH, DISTANCE, SPEED
+from touchcell.tasks.planned_motions import PlannedMotion, PlannedSlide
 from touchcell.tasks.planned_places import PlannedPlace
-from touchcell.tasks.servoing import ARM, ServoConfig, one_arm_task
+from touchcell.tasks.servoing import ARM, ServoConfig, one_arm_task, servo_motions
 from touchcell.tasks.surface_path import Guide, PathConfig
 
 _APPROACH_M = 0.02
@@ -136,13 +138,35 @@ def _behavior(config: SurfaceFollowingConfig) -> Follow | FollowPath:
 
 
 def _places(config: SurfaceFollowingConfig, T_base_tcp: Array | None, T_tcp_sensor: Array) -> Iterator[PlannedPlace]:
-    """Return the corners of the path, near the plane of the first contact; a straight way may end anywhere."""
-    if config.path is None or T_base_tcp is None:
+    """Return the corners of the path, or the end of the straight way, near the plane of the first contact."""
+    if T_base_tcp is None:
         return
     T_base_sensor = T_base_tcp @ T_tcp_sensor
-    for x, y in config.path.corners():
+    key, corners = ("path",), [_end(config)] if config.path is None else config.path.corners()
+    for x, y in corners:
         tip_m = T_base_sensor[:3, 3] + T_base_sensor[:3, :2] @ np.array([x, y])
-        yield PlannedPlace(("path",), ARM, tip_m=tip_m, slack_m=_APPROACH_M + _BEND * math.hypot(x, y))
+        slack_m = _APPROACH_M + _BEND * math.hypot(x, y)
+        yield PlannedPlace(("distance_mm",) if config.path is None else key, ARM, tip_m=tip_m, slack_m=slack_m)
+
+
+def _end(config: SurfaceFollowingConfig) -> Point:
+    """Return where the straight way ends, m, from the first contact on, along the sensor's x and y axes."""
+    angle, distance_m = math.radians(config.direction_deg), 1e-3 * config.distance_mm
+    return distance_m * math.cos(angle), distance_m * math.sin(angle)
+
+
+def _motions(config: SurfaceFollowingConfig) -> Iterator[PlannedMotion]:
+    yield from servo_motions(config)
+    along_m = [_end(config)] if config.path is None else config.path.corners()
+    yield PlannedSlide(
+        ("distance_mm",) if config.path is None else ("path",),
+        max(math.hypot(x, y) for x, y in along_m),
+        math.radians(config.direction_deg),
+        1e-3 * config.speed_mm_s,
+        1e-3 * config.depth_mm,
+        "run",
+        corners_m=() if config.path is None else tuple(along_m),
+    )
 
 
 SPEC = one_arm_task(
@@ -152,4 +176,5 @@ SPEC = one_arm_task(
     _behavior,
     lambda config: (0.0, 0.0, config.depth_mm, 0.0, 0.0, 0.0),
     _places,
+    lambda config, start, mount: _motions(config),
 )

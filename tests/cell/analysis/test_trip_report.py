@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 import yaml
 
+from tests.helpers import unforeseen
 from touchcell.cell.analysis.trip_report import REMEDIES
 from touchcell.cell.cli.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_TRIPPED
 from touchcell.cell.cli.main import main
@@ -32,7 +33,7 @@ def run_into_the_wall(folder: Path, **arm: Any) -> Path:
     """Run the shipped cell on true contacts, with a workspace that ends 8 mm after the start."""
     data = yaml.safe_load(SHIPPED.read_text())
     put_on_true_contact(data)
-    data["interlocks"]["workspace"]["max_mm"] = [-72, 50, 150]
+    unforeseen.run_into_the_wall(data)
     data["arms"]["arm"] |= arm
     cell = folder / "cell.yaml"
     cell.write_text(yaml.safe_dump(data))
@@ -111,7 +112,7 @@ def test_an_arm_that_ignores_every_command_still_leaves_a_black_box(
     monkeypatch.setattr(SimArm, "__init__", broken)
     data = yaml.safe_load(SHIPPED.read_text())
     put_on_true_contact(data)
-    data["interlocks"]["workspace"]["max_mm"] = [-72, 50, 150]
+    unforeseen.run_into_the_wall(data)
     cell, folder = tmp_path / "cell.yaml", tmp_path / "run"
     cell.write_text(yaml.safe_dump(data))
     assert main(["run", str(cell), "--out", str(folder), "--quiet"]) == EXIT_TRIPPED

@@ -52,7 +52,7 @@ def test_a_task_that_fails_is_1_and_its_reason_is_in_the_result_and_on_the_scree
 
 def test_a_trip_is_3(tmp_path: Path) -> None:
     path, folder = (
-        cell(tmp_path, interlocks__shear__limit_mm=0.01, interlocks__shear__hold_ms=0),
+        cell(tmp_path, interlocks__shear__limit_mm=0.25, interlocks__shear__hold_ms=0),
         tmp_path / "run",
     )
     assert main(["run", str(path), "--quiet", "--out", str(folder)]) == EXIT_TRIPPED
@@ -91,7 +91,7 @@ def run_into(path: Path, folder: Path, stdout: int | IO[str], stderr: int | IO[s
 
 
 @pytest.mark.parametrize("output", ["closed pipe", "/dev/full"])
-@pytest.mark.parametrize("limit_mm", [0.01, 6.0])
+@pytest.mark.parametrize("limit_mm", [0.25, 6.0])
 def test_the_exit_code_is_the_same_whatever_becomes_of_the_output(tmp_path: Path, output: str, limit_mm: float) -> None:
     path, folder = (
         cell(tmp_path, interlocks__shear__limit_mm=limit_mm, interlocks__shear__hold_ms=0),
@@ -107,8 +107,8 @@ def test_the_exit_code_is_the_same_whatever_becomes_of_the_output(tmp_path: Path
             code = run_into(path, folder, writing, writing)
         finally:
             os.close(writing)
-    assert code == (EXIT_TRIPPED if limit_mm == 0.01 else EXIT_OK)
-    assert result_of(folder)["outcome"] == ("tripped" if limit_mm == 0.01 else "done")
+    assert code == (EXIT_TRIPPED if limit_mm == 0.25 else EXIT_OK)
+    assert result_of(folder)["outcome"] == ("tripped" if limit_mm == 0.25 else "done")
 
 
 @pytest.fixture(scope="module")

@@ -15,6 +15,7 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.helpers.unforeseen import sway
 from touchcell.cell.cli.exit_codes import EXIT_OK, EXIT_TASK_FAILED
 from touchcell.cell.cli.main import main
 from touchcell.cell.config.true_contact import put_on_true_contact
@@ -192,7 +193,7 @@ def test_a_disk_that_fills_up_leaves_the_recording_the_black_box_and_a_result(
 def test_a_failed_run_is_explained(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     cell = true_contact_cell(tmp_path)
     data = yaml.safe_load(cell.read_text())
-    data["arms"]["arm"]["start_pose_mm_deg"] = [-80, 0, 120, 180, 0, 0]
+    sway(data)["arms"]["arm"]["start_pose_mm_deg"] = [-80, 0, 120, 180, 0, 0]
     cell.write_text(yaml.safe_dump(data))
     out = tmp_path / "run"
     assert main(["run", str(cell), "--out", str(out), "--quiet"]) == EXIT_TASK_FAILED

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import yaml
 
+from tests.helpers.unforeseen import run_into_the_wall
 from touchcell.cell.cli.main import main
 from touchcell.cell.config.schema import plan_cell
 from touchcell.cell.config.true_contact import put_on_true_contact
@@ -123,11 +124,8 @@ def test_second_stop_is_at_once(tmp_path: Path) -> None:
 
 
 def test_workspace_trip_latches_and_stops_the_arm(tmp_path: Path) -> None:
-    def narrow(data: dict[str, Any]) -> None:
-        data["interlocks"]["workspace"]["max_mm"] = [-72, 50, 150]
-
     with Recorder(tmp_path / "run.mcap") as recorder:
-        cell, result = run(true_contact_cell(tmp_path, narrow), recorder=recorder)
+        cell, result = run(true_contact_cell(tmp_path, run_into_the_wall), recorder=recorder)
     assert result.outcome is Outcome.TRIPPED
     assert result.reason.startswith("workspace")
     assert cell.task.state == "tripped"
@@ -240,10 +238,9 @@ def test_a_device_that_cannot_be_connected_leaves_the_others_disconnected(
 
 
 def test_trip_has_its_own_exit_code(tmp_path: Path) -> None:
-    def narrow(data: dict[str, Any]) -> None:
-        data["interlocks"]["workspace"]["max_mm"] = [-72, 50, 150]
-
-    assert main(["run", str(true_contact_cell(tmp_path, narrow)), "--out", str(tmp_path / "r"), "--quiet"]) == 3
+    assert (
+        main(["run", str(true_contact_cell(tmp_path, run_into_the_wall)), "--out", str(tmp_path / "r"), "--quiet"]) == 3
+    )
 
 
 def test_bad_cell_is_exit_code_two_and_one_line_on_stderr(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -138,7 +138,7 @@ def test_stl_has_every_triangle() -> None:
 
 def test_a_black_box_is_shown_by_the_same_widgets(runs: Path, tmp_path: Path) -> None:
     folder = tmp_path / "runs" / "tripped"
-    changes = ("task.distance_mm=40", "interlocks.shear.limit_mm=1")
+    changes = ("task.distance_mm=40", "interlocks.shear.limit_mm=2")
     settings = [word for each in changes for word in ("--set", each)]
     assert main(["run", "surface_follow_sim.yaml", "--quiet", "--out", str(folder), *settings]) == 3
     assert sources(folder) == [RECORDING, "blackbox.mcap"]

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as numpy_strategies
 
 from touchcell.drivers.core.clock import VirtualClock
-from touchcell.drivers.core.command_checks import finite_array
+from touchcell.drivers.core.command_checks import checked_twist_command, finite_array
 from touchcell.drivers.core.commands import Sent, TwistCommand, TwistFrame, read_only
 from touchcell.drivers.core.device import Lifecycle
 from touchcell.drivers.core.errors import CommandRejected, Rejection
@@ -480,3 +480,26 @@ def test_the_first_command_from_rest_accelerates_for_a_millisecond_at_most() -> 
     assert np.linalg.norm(harness.send(ttl_s=0.5).command.twist) == pytest.approx(0.5e-3)
     at_zero = GateHarness(NO_JERK, start_ns=0)
     assert np.linalg.norm(at_zero.send(ttl_s=0.5, after_s=0.0).command.twist) == pytest.approx(0.5e-3)
+
+
+class _Marked(TwistCommand):
+    """A command of another package's own class."""
+
+
+@pytest.mark.parametrize(
+    ("kind", "t_ns", "ttl_s"),
+    [
+        (TwistCommand, np.int64(5), 0.1),
+        (TwistCommand, 5, np.float32(0.125)),
+        (_Marked, 5, 0.1),
+    ],
+)
+def test_what_is_checked_consists_of_plain_numbers_and_is_no_class_of_others(
+    kind: type[TwistCommand], t_ns: int, ttl_s: float
+) -> None:
+    command = kind(read_only(np.zeros(6)), TwistFrame.BASE, t_ns, ttl_s)
+    checked = checked_twist_command("arm", command)
+    assert type(checked) is TwistCommand
+    assert type(checked.t_ns) is int
+    assert type(checked.ttl_s) is float
+    assert (checked.t_ns, checked.ttl_s) == (int(t_ns), float(ttl_s))

@@ -35,6 +35,7 @@ from touchcell.tasks.interface import Task, TaskContext
 
 if TYPE_CHECKING:
     from touchcell.cell.config.cell_plan import CellPlan
+    from touchcell.perception.models.model_file import Header
     from touchcell.perception.runtime.network_estimator import NetworkEstimator
 
 REQUIRED_OF_ARMS: Final = ("workspace", "tcp_speed", "arm_state_age")
@@ -56,6 +57,9 @@ _TIP_M = 0.02
 """No tip is pressed in or sheared further than its own radius."""
 _LONGEST_REACH_M = 3.0
 """Reach of an arm whose chain is not known."""
+_SUREST = 0.75
+"""Part of its mean error on the validation images that a network states as deviation at its best."""
+_DEPTH_LABEL: Final = {True: "z_mm", False: "v_z"}
 _DRIFTS_S = 60.0
 """A filter that is not corrected for this long has lost its contact."""
 
@@ -308,7 +312,19 @@ def _network_facts(estimator: NetworkEstimator, arm: str | None, T_tcp_sensor: A
         innovations=estimator.filter is not None,
         images=True,
         markers=header.architecture.reports_markers,
+        least_sigma_m=_least_sigma_m(header),
     )
+
+
+def _least_sigma_m(header: Header) -> float:
+    """Return the smallest standard deviation of the depth that a calibrated network reports; 0 if it is not known.
+
+    It cannot be surer than a share of the error that it had on its own validation images.
+    """
+    errors = header.training.get("validation_mae")
+    if not isinstance(errors, list) or len(errors) != len(header.labels.names):
+        return 0.0
+    return 1e-3 * _SUREST * float(errors[header.labels.names.index(_DEPTH_LABEL[header.labels.are_contacts])])
 
 
 def _unknown(name: str, arm: str | None, T_tcp_sensor: Array, rate_hz: float) -> SensorFacts:

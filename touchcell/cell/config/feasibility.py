@@ -5,23 +5,22 @@ from __future__ import annotations
 import importlib.util
 import math
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-import numpy as np
-from pydantic import BaseModel
-
-from touchcell.cell.config.yaml_file import KeyPath, YamlFile
+from touchcell.cell.config.demands import demands
+from touchcell.cell.config.feasible_motion import unfeasible_motions
+from touchcell.cell.config.rule_limits import is_kind, limits_of
+from touchcell.cell.config.starts import pose_of, start_of_arm
+from touchcell.cell.config.yaml_file import YamlFile
 from touchcell.drivers.core.arm import LimitsConfig
 from touchcell.drivers.core.scene import scene_section
 from touchcell.errors import ConfigError, suggest
 from touchcell.geometry import se3
 from touchcell.geometry.errors import GeometryError
-from touchcell.geometry.types import Array
 from touchcell.input_file import BUILTIN
 from touchcell.perception.runtime.filter_spec import FILTERS, FilterConfig
-from touchcell.tasks.interface import Demand
 
 if TYPE_CHECKING:
     from touchcell.cell.config.cell_plan import CellPlan
@@ -30,13 +29,12 @@ if TYPE_CHECKING:
 _SLACK: Final = 1.0 + 1e-9
 _OF_EDGES: Final = ("sim_edge",)
 """Shipped networks of edges."""
-_EXACTNESS_MM: Final = 1e-3
 _LONGEST_HEADER: Final = 100 << 20
 
 
 def unfeasible(file: YamlFile, plan: CellPlan) -> list[ConfigError]:
     """Return one problem for everything that ``plan`` would be refused for, or would surely trip or fail on."""
-    return [
+    problems = [
         *_models(file, plan),
         *(scene := list(_scene(file, plan))),
         *_features(file, plan),
@@ -45,9 +43,10 @@ def unfeasible(file: YamlFile, plan: CellPlan) -> list[ConfigError]:
         *_speeds(file, plan),
         *_distances(file, plan),
         *(starts := list(_starts(file, plan))),
-        *(() if starts else _places(file, plan)),
         *(() if starts or scene else _contacts(file, plan)),
     ]
+    # A run that is refused anyway is not followed.
+    return problems or list(unfeasible_motions(file, plan))
 
 
 def _models(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
@@ -138,11 +137,11 @@ def _interlock_sensors(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
 
 
 def _depths(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
-    limits = _limits(plan, "depth", "limit_mm")
+    limits = limits_of(plan, "depth", "limit_mm")
     if not limits:
         return
     rule, limit_mm = min(limits.items(), key=lambda each: each[1])
-    for key, depth_mm in _demands(plan.task_config, "depth"):
+    for key, depth_mm in demands(plan.task_config, "depth"):
         if depth_mm >= limit_mm:
             yield file.problem(
                 ("task", *key),
@@ -159,8 +158,10 @@ def _speeds(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
         for device in plan.arms.values()
         if isinstance(limits := getattr(device.config, "limits", None), LimitsConfig)
     }
-    rules = {f"interlocks.{name}.limit_m_s": 1e3 * m_s for name, m_s in _limits(plan, "tcp_speed", "limit_m_s").items()}
-    for key, speed_mm_s in _demands(plan.task_config, "speed"):
+    rules = {
+        f"interlocks.{name}.limit_m_s": 1e3 * m_s for name, m_s in limits_of(plan, "tcp_speed", "limit_m_s").items()
+    }
+    for key, speed_mm_s in demands(plan.task_config, "speed"):
         for group, reason in ((bounds, "is more than any arm may move"), (rules, "would trip")):
             if not group:
                 continue
@@ -176,11 +177,11 @@ def _speeds(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
 
 
 def _distances(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
-    boxes: list[Any] = [box for box in plan.cell.interlocks.values() if _is_kind(box, "workspace")]
+    boxes: list[Any] = [box for box in plan.cell.interlocks.values() if is_kind(box, "workspace")]
     if not boxes:
         return
     longest_mm = max(math.dist(box.max_mm, box.min_mm) for box in boxes)
-    for key, distance_mm in _demands(plan.task_config, "distance"):
+    for key, distance_mm in demands(plan.task_config, "distance"):
         if distance_mm > longest_mm * _SLACK:
             yield file.problem(
                 ("task", *key),
@@ -191,7 +192,7 @@ def _distances(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
 
 
 def _starts(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
-    boxes: dict[str, Any] = {rule: box for rule, box in plan.cell.interlocks.items() if _is_kind(box, "workspace")}
+    boxes: dict[str, Any] = {rule: box for rule, box in plan.cell.interlocks.items() if is_kind(box, "workspace")}
     for rule, box in boxes.items():
         name = plan.arm_roles.get(box.arm, box.arm)
         start = getattr(plan.arms[name].config, "start_pose_mm_deg", None) if name in plan.arms else None
@@ -222,35 +223,6 @@ def _starts(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
             )
 
 
-def _places(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
-    """Places to which the task surely takes an arm, outside a box that it must not leave."""
-    if plan.task.places is None or not plan.sensor_roles:
-        return
-    sensor = plan.cell.sensors[plan.sensor_roles[min(plan.sensor_roles)]]
-    start = _start(plan, sensor.mounted_on) if sensor.mounted_on is not None else None
-    boxes: dict[str, Any] = {rule: box for rule, box in plan.cell.interlocks.items() if _is_kind(box, "workspace")}
-    reported = set()
-    for place in plan.task.places(plan.task_config, start, sensor.T_tcp_sensor):
-        for rule, box in boxes.items():
-            if place.key in reported or box.arm != place.arm:
-                continue
-            carried = plan.sensor_roles.get(box.sensor or "")
-            mount = np.eye(4) if carried is None else plan.cell.sensors[carried].T_tcp_sensor
-            point_mm, slack_mm = 1e3 * place.point_m(mount), 1e3 * place.slack_m + _EXACTNESS_MM
-            outside = [
-                f"{axis} = {value:.4g} mm, limit {low if value < low else high:g} mm"
-                for axis, value, low, high in zip("xyz", point_mm, box.min_mm, box.max_mm, strict=True)
-                if value < low - slack_mm or value > high + slack_mm
-            ]
-            if outside:
-                reported.add(place.key)
-                yield file.problem(
-                    ("task", *place.key),
-                    f"leads out of interlocks.{rule}, which would trip: {'; '.join(outside)}",
-                    hint="go less far, or make the workspace larger",
-                )
-
-
 def _contacts(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
     """Tips pressed into the scene at the start of a task whose first frame has no contact; and no edge."""
     if plan.cell.scene is None or not plan.task.starts_free or plan.cell.truth is not None:
@@ -258,8 +230,8 @@ def _contacts(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
     tips, arms = {}, {}
     for name in plan.sensor_roles.values():
         sensor = plan.cell.sensors[name]
-        if sensor.mounted_on is not None and (start := _start(plan, sensor.mounted_on)) is not None:
-            base = _pose(plan.cell.arms[sensor.mounted_on].base_pose_mm_deg)
+        if sensor.mounted_on is not None and (start := start_of_arm(plan, sensor.mounted_on)) is not None:
+            base = pose_of(plan.cell.arms[sensor.mounted_on].base_pose_mm_deg)
             if base is not None:
                 arms[name], tips[name] = sensor.mounted_on, base @ start @ sensor.T_tcp_sensor
     scene = scene_section().model_validate(plan.cell.scene)
@@ -278,49 +250,3 @@ def _contacts(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
             f"the tip of {name!r} is {1e3 * depth_m:.1f} mm deep in something there, but the task starts free",
             hint="start farther away",
         )
-
-
-def _start(plan: CellPlan, arm: str) -> Array | None:
-    """Pose (4, 4) of an arm's tool in its base frame at the start, if the cell knows it."""
-    pose = getattr(plan.arms[arm].config, "start_pose_mm_deg", None)
-    return None if pose is None else _pose(pose)
-
-
-def _pose(pose_mm_deg: Any) -> Array | None:
-    """Pose (4, 4) of six numbers; None if they are none."""
-    try:
-        return se3.from_euler_mm_deg(pose_mm_deg)
-    except GeometryError:
-        return None
-
-
-def _limits(plan: CellPlan, kind: str, key: str) -> Mapping[str, float]:
-    """Limit of each interlock of ``kind``, by the name of the interlock."""
-    entries = {name: entry for name, entry in plan.cell.interlocks.items() if _is_kind(entry, kind)}
-    return {name: float(getattr(entry, key)) for name, entry in entries.items()}
-
-
-def _is_kind(entry: Any, kind: str) -> bool:
-    return bool(getattr(entry, "kind", "") == kind)
-
-
-def _demands(config: Any, quantity: str, at: KeyPath = ()) -> Iterator[tuple[KeyPath, float]]:
-    """What a task's parameters ask for, with the key of each; steps of a task are wrapped in their own names."""
-    if isinstance(config, list | tuple):
-        for index, each in enumerate(config):
-            yield from _demands(each, quantity, (*at, index, *_wrapper(each)))
-    if not isinstance(config, BaseModel):
-        return
-    for name, info in type(config).model_fields.items():
-        value = getattr(config, name)
-        demand = next((each for each in info.metadata if isinstance(each, Demand)), None)
-        if demand is None:
-            yield from _demands(value, quantity, (*at, name))
-        elif demand.quantity == quantity and value is not None:
-            numbers = value if isinstance(value, tuple) else (value,)
-            yield (*at, name), float(max(numbers) if demand.item is None else numbers[demand.item])
-
-
-def _wrapper(step: Any) -> KeyPath:
-    kind = getattr(step, "kind", None)
-    return (kind,) if isinstance(kind, str) else ()

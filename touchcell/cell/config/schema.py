@@ -6,6 +6,7 @@ task fit, and says which devices the task does not need, so that they are not ev
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
 from collections.abc import Collection, Mapping
@@ -444,6 +445,7 @@ class _Planner:
     def _require_armed(self, plan: CellPlan) -> CellPlan:
         """An interlock that cannot trip, and what moves or feels and nothing guards, is refused."""
         from touchcell.cell.config.armed import cell_facts, not_armed, prove_cell
+        from touchcell.cell.config.healthy_motion import trips_in_motion
         from touchcell.cell.config.healthy_start import trips_when_healthy
 
         try:
@@ -453,7 +455,8 @@ class _Planner:
             self._add(tuple(error.key.split(".")), error.reason, value=error.value, hint=error.hint)
             raise InvalidCell(self._problems) from None
         # What cannot trip is shown nothing that must not trip it.
-        for problem in list(not_armed(plan, facts, proofs)) or trips_when_healthy(plan, facts):
+        healthy = (trips(plan, facts) for trips in (trips_when_healthy, trips_in_motion))
+        for problem in list(not_armed(plan, facts, proofs)) or itertools.chain.from_iterable(healthy):
             self._add(problem.path, problem.reason, hint=problem.hint)
         if self._problems:
             raise InvalidCell(self._problems)

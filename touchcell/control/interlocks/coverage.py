@@ -58,6 +58,7 @@ class SensorFacts:
         T_tcp_sensor: (4, 4) its mount.
         depth_m, shear_m, torsion_rad: the largest values that its estimator can report.
         sigma_m: the largest standard deviation of the depth that it can report; 0 if it reports none.
+        least_sigma_m: the smallest standard deviation of the depth that one of its frames has; 0 if that is not known.
         frame_rate_hz: rate of its frames.
         leaves_range: True if it can report to be outside its training range.
         innovations: True if a filter reports normalised innovations.
@@ -77,6 +78,7 @@ class SensorFacts:
     innovations: bool = False
     images: bool = False
     markers: bool = False
+    least_sigma_m: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -130,6 +130,66 @@ class SceneSection(BaseModel):
         """
         return {}
 
+    def touches(self, T_world_s: Array) -> bool:
+        """Return whether a tip at a pose (4, 4) may touch something, at the start or as something moves there."""
+        return True
+
+    def meets(self, T_world_s: Array, way_m: Array, depth_m: float = 0.0) -> bool:
+        """Return whether a tip may touch something on a straight way, as the scene is at the start.
+
+        Args:
+            T_world_s: (4, 4) pose of the sensor where the way begins.
+            way_m: (3,) along world axes.
+            depth_m: depth that the contact has to reach.
+        """
+        return True
+
+    def most_shear_m(self, depth_m: float) -> float | None:
+        """Return the largest shear that a contact of a depth holds before it slides; None if that is not known."""
+        return None
+
+    def way_over(
+        self,
+        T_world_s: Array,
+        direction_rad: float,
+        distance_m: float,
+        depth_m: float,
+        reach_m: float,
+        back_m: float,
+    ) -> Array | None:
+        """Return the way (n, 3), m, of a tip that approaches along its axis and then goes straight over the surface.
+
+        None where it makes no contact, or what it touches moves.
+
+        Args:
+            T_world_s: (4, 4) pose of the sensor at the start.
+            direction_rad: from the sensor's x axis towards its y axis.
+            distance_m: along the surface.
+            depth_m: of the contact.
+            reach_m: within which it makes contact.
+            back_m: how far it withdraws at the end; that is the last row.
+        """
+        return None
+
+    def ride(self, T_world_s: Array, reach_m: float, lasts_s: float) -> Array | None:
+        """Return the way (n, 3), m, of a tip that approaches along its axis and goes along with what it touches.
+
+        None where it makes no contact, or nobody knows how that moves.
+
+        Args:
+            T_world_s: (4, 4) pose of the sensor at the start.
+            reach_m: within which it makes contact.
+            lasts_s: for so long.
+        """
+        return None
+
+    def points_over(self, T_world_s: Array, points: Array, depth_m: float, reach_m: float) -> Array | None:
+        """Return where (n, 3), m, the tip is at points (n, 2), m, of the plane of its first contact.
+
+        None where it makes no contact, or what it touches moves. The other arguments are those of ``way_over``.
+        """
+        return None
+
     def has_edges(self) -> bool:
         """Return whether anything in it has an edge that could be followed."""
         return True

@@ -14,6 +14,9 @@ from touchcell.perception.errors import ImageError
 BLOCKS = 8
 """Number of blocks along each side in which the image is compared."""
 
+CHANGE_PERCENT_PER_MM = 10.0
+"""By which the score rises with the depth, on simulated images."""
+
 MOST_CHANGED = 8
 """Number of the most changed blocks that decide: a first touch moves markers in an eighth of the image."""
 

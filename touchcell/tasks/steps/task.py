@@ -21,7 +21,7 @@ from touchcell.tasks.state_machine import FAULT, STOP, TRIP, TaskMachine, state_
 from touchcell.tasks.state_machine_task import MachineTask
 from touchcell.tasks.steps.compiler import compile_steps
 from touchcell.tasks.steps.model import Hold, Leaf, Move, Record, Retract, Servo, StepsConfig, Until, leaves
-from touchcell.tasks.steps.places import planned_places
+from touchcell.tasks.steps.places import planned_motions, planned_places
 
 _GAIN_PER_S = 10.0
 _SI = np.array([1e-3] * 3 + [np.pi / 180.0] * 3)
@@ -330,5 +330,6 @@ SPEC = TaskSpec(
     sensors=frozenset({SENSOR}),
     build=StepsTask,
     forces=_forces,
-    places=lambda config, start, mount: planned_places(config.steps, start, mount),
+    places=planned_places,
+    motions=planned_motions,
 )

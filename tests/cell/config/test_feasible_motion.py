@@ -1,0 +1,207 @@
+"""A run that every time would trip or fail on what its task does is refused before, with the key that decides."""
+
+from __future__ import annotations
+
+import copy
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from touchcell.cell.config.layers import load_layers
+from touchcell.cell.config.schema import plan_cell
+from touchcell.cell.config.yaml_file import InvalidCell
+from touchcell.errors import ConfigError
+from touchcell.paths import CONFIGS
+
+SHIPPED = {path.stem: load_layers(path).data for path in CONFIGS.glob("*_sim.yaml")}
+FOLLOW, PUSH, STEPS = "surface_follow_sim", "single_push_sim", "steps_sim"
+TOUCH = {"move": {"by_mm_deg": [0, 0, 40], "until": {"contact": True}}}
+PRESS = {"servo": {"depth_mm": 2, "until": {"time_s": 1}}}
+Change = tuple[str, Any]
+
+
+def changed(name: str, *changes: Change) -> dict[str, Any]:
+    data = copy.deepcopy(dict(SHIPPED[name]))
+    for path, value in changes:
+        *above, key = path.split(".")
+        at: Any = data
+        for part in above:
+            at = at[int(part)] if isinstance(at, list) else at[part]
+        at[key] = value
+    return data
+
+
+@pytest.fixture
+def cell(tmp_path: Path) -> Callable[..., Path]:
+    def written(name: str, *changes: Change) -> Path:
+        path = tmp_path / "cell.yaml"
+        path.write_text(yaml.safe_dump(changed(name, *changes), sort_keys=False))
+        return path
+
+    return written
+
+
+def problem(path: Path) -> ConfigError:
+    with pytest.raises(InvalidCell) as caught:
+        plan_cell(path)
+    (found,) = caught.value.problems
+    assert found.line > 0
+    return found
+
+
+TIGHT = [
+    (FOLLOW, [("interlocks.uncertain.limit_mm", 0.05)], "interlocks.uncertain.limit_mm", "the least that network"),
+    (PUSH, [("interlocks.uncertain", {"kind": "uncertain", "limit_mm": 0.05})], "interlocks.uncertain.limit_mm", ""),
+    (FOLLOW, [("interlocks.shear.limit_mm", 1.5)], "interlocks.shear.limit_mm", "as the tip slides at 3 mm of depth"),
+    (FOLLOW, [("interlocks.shear.limit_mm", 0.05)], "interlocks.shear.limit_mm", "as task.check_shift_mm shears"),
+    (PUSH, [("interlocks.shear.limit_mm", 0.1)], "interlocks.shear.limit_mm", "as task.check_shift_mm shears"),
+    (
+        FOLLOW,
+        [("interlocks.slip", {"kind": "slip", "limit_ratio": 0.3, "hold_ms": 100})],
+        "interlocks.slip.limit_ratio",
+        "shear per depth 0.59",
+    ),
+    (FOLLOW, [("interlocks.limited.limit_ms", 5)], "interlocks.limited.limit_ms", "task.approach_speed_mm_s"),
+    (PUSH, [("interlocks.limited.limit_ms", 25)], "interlocks.limited.limit_ms", "task.retract_speed_mm_s"),
+    (STEPS, [("interlocks.limited.limit_ms", 10)], "interlocks.limited.limit_ms", "steps.0.move.speed_mm_s"),
+    (FOLLOW, [("interlocks.inconsistent.limit_nis", 0.5)], "interlocks.inconsistent.limit_nis", "consistent filter"),
+    (FOLLOW, [("interlocks.tcp_speed.limit_rad_s", 0.05)], "interlocks.tcp_speed.limit_rad_s", "check_tilt_deg turns"),
+]
+WAYS = [
+    (FOLLOW, [("interlocks.workspace.max_mm", [50, 50, 150])], "task.distance_mm", "over the surface, .* x = 5"),
+    (FOLLOW, [("task.direction_deg", 90)], "task.distance_mm", "y = -5"),
+    ("surface_follow_dome_sim", [("task.distance_mm", 300)], "task.distance_mm", "x = 12"),
+    ("surface_mesh_sim", [("interlocks.workspace.max_mm", [10, 100, 100])], "task.path", "x = 30 mm, limit 10 mm"),
+    (FOLLOW, [("task.retract_mm", 140)], "task.retract_mm", "z = 1"),
+]
+WAYS += [
+    ("object_track_sim", [("interlocks.workspace.max_mm", [30, 200, 120])], "task.duration_s", "x = .* limit 30 mm"),
+    (PUSH, [("task.target_mm", [-120, 0])], "task.target_mm", "is behind the sensor"),
+]
+TOUCHES = [
+    (FOLLOW, [("task.depth_mm", 0.05)], "task.depth_mm", "is no contact to the gate"),
+    (FOLLOW, [("task.depth_mm", 4.95)], "task.depth_mm", "known to 0.06 mm at best"),
+    (
+        FOLLOW,
+        [("sensors.sensor.estimator.gate", {"touch_percent": 0.01, "release_percent": 0.005})],
+        "sensors.sensor.estimator.gate.touch_percent",
+        "noise alone",
+    ),
+    (STEPS, [("task.steps", [PRESS])], "task.steps.0.servo", "standing clear of the scene"),
+    (STEPS, [("task.steps", [{"hold": {"time_s": 1}}, PRESS])], "task.steps.1.servo", "standing clear of the scene"),
+    (STEPS, [("task.steps", [TOUCH, {"retract": {"distance_mm": 30}}, PRESS])], "task.steps.2.servo", "by 30 mm"),
+    (
+        STEPS,
+        [("task.steps", [{"move": {"by_mm_deg": [0, 0, 5], "frame": "contact"}}])],
+        "task.steps.0.move",
+        "standing clear of the scene",
+    ),
+    (
+        STEPS,
+        [("task.steps", [{"move": {"by_mm_deg": [0, 0, 10], "until": {"contact": True}}}])],
+        "task.steps.0.move.by_mm_deg",
+        "touches nothing at all",
+    ),
+    (
+        STEPS,
+        [("task.steps", [{"move": {"by_mm_deg": [0, 0, 21], "until": {"depth_mm": 4}}}])],
+        "task.steps.0.move.by_mm_deg",
+        "touches nothing 4 mm deep",
+    ),
+    (FOLLOW, [("arms.arm.start_pose_mm_deg", [-80, 0, 100, 180, 0, 0])], "task.approach_distance_mm", "meets nothing"),
+    (PUSH, [("arms.arm.start_pose_mm_deg", [-140, 0, 30, 180, 0, 0])], "task.approach_distance_mm", "meets nothing"),
+    (
+        FOLLOW,
+        [("sensors.sensor.estimator.gate", {"touch_percent": 60, "release_percent": 50})],
+        "sensors.sensor.estimator.gate.touch_percent",
+        "at about 6 mm of depth",
+    ),
+    (FOLLOW, [("task.check_press_mm", 6)], "task.check_press_mm", "6 mm is not below the limit"),
+    (
+        STEPS,
+        [("task.steps.0.repeat.steps.0.move.speed_mm_s", 80)],
+        "task.steps.0.repeat.steps.0.move.speed_mm_s",
+        "deep before it stands",
+    ),
+]
+TIMES = [
+    (
+        STEPS,
+        [("task.steps.0.repeat.steps.5.move.timeout_s", 1)],
+        "task.steps.0.repeat.steps.5.move.timeout_s",
+        "1.25 s",
+    ),
+    (
+        STEPS,
+        [("task.steps.0.repeat.steps.4.retract.timeout_s", 0.5)],
+        "task.steps.0.repeat.steps.4.retract.timeout_s",
+        "takes 1 s",
+    ),
+    (
+        STEPS,
+        [("task.steps", [TOUCH, {"servo": {"depth_mm": 2, "until": {"distance_mm": 10}}}])],
+        "task.steps.1.servo.timeout_s",
+        "never ends",
+    ),
+    (FOLLOW, [("task.settle_timeout_s", 0.2)], "task.settle_timeout_s", "0.3 s at least to settle"),
+    (FOLLOW, [("task.prepare_timeout_s", 0.1)], "task.prepare_timeout_s", "0.2 s at least to back off"),
+    (PUSH, [("task.push_timeout_s", 1)], "task.push_timeout_s", "at least to push so far"),
+    (FOLLOW, [("task.max_frame_age_ms", 15)], "task.max_frame_age_ms", "come after 10 ms"),
+    (FOLLOW, [("task.kp_per_s", [0, 0, 300, 8, 8, 0])], "task.kp_per_s", "overshoots by more than the error"),
+    (FOLLOW, [("task.kp_per_s", [0, 0, -8, 8, 8, 0])], "task.kp_per_s.2", "greater than or equal to 0"),
+]
+
+
+@pytest.mark.parametrize(("name", "changes", "key", "words"), [*TIGHT, *WAYS, *TOUCHES, *TIMES])
+def test_it_is_refused_with_the_key_that_decides(
+    cell: Callable[..., Path], name: str, changes: list[Change], key: str, words: str
+) -> None:
+    found = problem(cell(name, *changes))
+    assert found.key == key
+    assert re.search(words, found.reason), found.reason
+
+
+ACCEPTED = [
+    (FOLLOW, [("interlocks.uncertain.limit_mm", 0.2)]),
+    (FOLLOW, [("interlocks.shear.limit_mm", 4)]),
+    (PUSH, [("interlocks.shear.limit_mm", 1)]),
+    (FOLLOW, [("interlocks.limited.limit_ms", 100)]),
+    (FOLLOW, [("interlocks.tcp_speed.limit_rad_s", 0.5)]),
+    (FOLLOW, [("interlocks.workspace.max_mm", [110, 50, 150])]),
+    (FOLLOW, [("task.depth_mm", 4.5)]),
+    # A run may be ended before its task is.
+    (FOLLOW, [("max_duration_s", 5)]),
+    (PUSH, [("task.target_mm", [-120, 0]), ("task.goal_heading_deg", 180)]),
+    ("object_track_sim", [("task.duration_s", 1), ("interlocks.workspace.max_mm", [30, 200, 120])]),
+    # A contact is felt, or the step ends, before it would trip.
+    (STEPS, [("task.steps", [{"servo": {"depth_mm": 2, "until": {"time_s": 0.3}}}])]),
+    (STEPS, [("task.steps", [{"servo": {"depth_mm": 2, "until": {"contact": False}}}])]),
+    (STEPS, [("task.steps", [{"move": {"by_mm_deg": [0, 0, 22]}}, PRESS])]),
+    (STEPS, [("task.steps", [TOUCH, {"retract": {"distance_mm": 1}}, PRESS])]),
+    # Whether nothing is met on half the way does not matter where time may end it.
+    (STEPS, [("task.steps", [{"move": {"by_mm_deg": [0, 0, 10], "until": {"contact": True, "time_s": 0.1}}}])]),
+]
+
+
+@pytest.mark.parametrize(("name", "changes"), ACCEPTED)
+def test_what_a_run_may_well_do_is_accepted(cell: Callable[..., Path], name: str, changes: list[Change]) -> None:
+    plan_cell(cell(name, *changes))
+
+
+def test_without_a_model_nothing_is_checked_by_a_motion_and_nothing_backs_off(cell: Callable[..., Path]) -> None:
+    """The true contact is not checked, so that neither shift nor tilt nor the way back is made."""
+    data = changed(FOLLOW)
+    kept = {rule: entry for rule, entry in data["interlocks"].items() if rule in ("workspace", "tilt", "tcp_speed")}
+    kept |= {rule: data["interlocks"][rule] for rule in ("indentation", "stale_frame", "stale_arm")}
+    kept["tcp_speed"] = {**kept["tcp_speed"], "limit_rad_s": 0.05}
+    changes = [
+        ("interlocks", {**kept, "shear": {"kind": "shear", "limit_mm": 0.05, "hold_ms": 100}}),
+        ("sensors.sensor.estimator", {"kind": "true_contact"}),
+        ("task.prepare_timeout_s", 0.1),
+        ("task.distance_mm", 2),
+    ]
+    plan_cell(cell(FOLLOW, *changes))

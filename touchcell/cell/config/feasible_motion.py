@@ -1,0 +1,338 @@
+"""Motions and contacts of a valid cell file with which every run would trip or fail."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from touchcell.cell.config.demands import demands
+from touchcell.cell.config.rule_limits import is_kind, limits_of
+from touchcell.cell.config.starts import pose_of, start_of_arm, start_of_sensor
+from touchcell.cell.config.yaml_file import KeyPath, YamlFile
+from touchcell.drivers.core.arm import LimitsConfig
+from touchcell.drivers.core.scene import scene_section
+from touchcell.errors import ConfigError
+from touchcell.geometry.types import Array
+from touchcell.perception.runtime.contact_gate import CHANGE_PERCENT_PER_MM
+from touchcell.tasks.planned_motions import (
+    Impossible,
+    PlannedHold,
+    PlannedRide,
+    PlannedSlide,
+    PlannedStart,
+    PlannedTime,
+    PlannedTouch,
+)
+
+if TYPE_CHECKING:
+    from touchcell.cell.config.cell_plan import CellPlan
+
+# Numbers that are equal but for rounding are no contradiction.
+_SLACK: Final = 1.0 + 1e-9
+_EXACTNESS_MM: Final = 1e-3
+_REACH_SLACK_M: Final = 5e-3
+_RIDE_SLACK_M: Final = 0.025
+_LEAST_TOUCH_PERCENT: Final = 0.1
+"""A quarter of a grey level."""
+_LIGHTEST: Final = 0.5
+"""Part of the depth at which a contact ends as its image says that surely is none."""
+_WAY_SLACK_MM: Final = 5.0
+"""By which a way over a surface may be elsewhere: the sensor turns with the surface a little late."""
+
+
+def unfeasible_motions(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
+    """Return one problem for every parameter of a task that no run could follow; the cell has no other problem."""
+    for problems in (_impossible, _times, _ages, _gates, _too_light, _gains, _pressing, _places, _untouched, _unmet):
+        yield from problems(file, plan)
+
+
+def _places(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
+    """Places to which the task surely takes an arm, outside a box that it must not leave."""
+    if not plan.sensor_roles:
+        return
+    start, mount = start_of_sensor(plan)
+    boxes: dict[str, Any] = {rule: box for rule, box in plan.cell.interlocks.items() if is_kind(box, "workspace")}
+    # A way over a known surface is known better than by the plane of the first contact.
+    ways = dict(_ways(plan))
+    reported: set[KeyPath] = set()
+    for key, way_m in ways.items():
+        for rule, box in boxes.items():
+            beyond = np.maximum(np.array(box.min_mm) - 1e3 * way_m, 1e3 * way_m - np.array(box.max_mm))
+            left = np.flatnonzero((beyond > _WAY_SLACK_MM).any(axis=1))
+            if left.size and box.sensor in plan.sensor_roles and not reported:
+                reported.add(key)
+                at_mm = 1e3 * way_m[left[0]]
+                yield file.problem(
+                    ("task", *key),
+                    f"leads out of interlocks.{rule} over the surface, which would trip: "
+                    f"{_outside(at_mm, box, _WAY_SLACK_MM)}",
+                    hint="go less far, or make the workspace larger",
+                )
+    for place in () if plan.task.places is None else plan.task.places(plan.task_config, start, mount):
+        for rule, box in boxes.items():
+            if place.key in reported or place.key in ways or box.arm != place.arm:
+                continue
+            carried = plan.sensor_roles.get(box.sensor or "")
+            mount = np.eye(4) if carried is None else plan.cell.sensors[carried].T_tcp_sensor
+            point_mm, slack_mm = 1e3 * place.point_m(mount), 1e3 * place.slack_m + _EXACTNESS_MM
+            if outside := _outside(point_mm, box, slack_mm):
+                reported.add(place.key)
+                yield file.problem(
+                    ("task", *place.key),
+                    f"leads out of interlocks.{rule}, which would trip: {outside}",
+                    hint="go less far, or make the workspace larger",
+                )
+
+
+def _outside(point_mm: Array, box: Any, slack_mm: float) -> str:
+    """Return along which axes a point is outside a box by more than a slack; empty if it is not."""
+    return "; ".join(
+        f"{axis} = {value:.4g} mm, limit {low if value < low else high:g} mm"
+        for axis, value, low, high in zip("xyz", point_mm, box.min_mm, box.max_mm, strict=True)
+        if value < low - slack_mm or value > high + slack_mm
+    )
+
+
+def _ways(plan: CellPlan) -> Iterator[tuple[KeyPath, Array]]:
+    """Ways (n, 3), m, of the sensor over surfaces of the scene, in the base frame of its arm, by the task's key."""
+    start, mount = start_of_sensor(plan)
+    reach_mm = getattr(plan.task_config, "approach_distance_mm", None)
+    if plan.cell.scene is None or plan.task.motions is None or start is None or reach_mm is None:
+        return
+    arm = plan.cell.sensors[plan.sensor_roles[min(plan.sensor_roles)]].mounted_on
+    base = None if arm is None else pose_of(plan.cell.arms[arm].base_pose_mm_deg)
+    if base is None:
+        return
+    scene = scene_section().model_validate(plan.cell.scene)
+    for motion in plan.task.motions(plan.task_config, start, mount):
+        if isinstance(motion, PlannedSlide) and motion.known:
+            tip, corners_m = base @ start @ mount, np.array(motion.corners_m)
+            if motion.corners_m:
+                way = scene.points_over(tip, corners_m, motion.depth_m, 1e-3 * reach_mm)
+            else:
+                retract_m = 1e-3 * float(getattr(plan.task_config, "retract_mm", 0.0))
+                way = scene.way_over(
+                    tip, motion.direction_rad, motion.distance_m, motion.depth_m, 1e-3 * reach_mm, retract_m
+                )
+                if way is not None:
+                    yield motion.key, (way[:-1] - base[:3, 3]) @ base[:3, :3]
+                    yield ("retract_mm",), (way[-1:] - base[:3, 3]) @ base[:3, :3]
+                continue
+            if way is not None:
+                yield motion.key, (way - base[:3, 3]) @ base[:3, :3]
+        elif isinstance(motion, PlannedRide):
+            way = scene.ride(base @ start @ mount, 1e-3 * reach_mm, motion.lasts_s)
+            if way is not None:
+                # The contact is made a little later, when the surface has moved on.
+                inner = (way - base[:3, 3]) @ base[:3, :3]
+                yield motion.key, inner + (inner[0] - inner) * min(1.0, _RIDE_SLACK_M / _extent(inner))
+
+
+def _extent(way_m: Array) -> float:
+    """Return how far a way (n, 3) gets from its start, or a micrometre."""
+    return max(float(np.linalg.norm(way_m - way_m[0], axis=1).max()), 1e-6)
+
+
+def _impossible(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
+    for motion in () if plan.task.motions is None else plan.task.motions(plan.task_config, *start_of_sensor(plan)):
+        if isinstance(motion, Impossible):
+            yield file.problem(("task", *motion.key), motion.why, hint=motion.hint)
+
+
+def _times(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
+    """Times that are shorter than what they are for."""
+    if plan.task.motions is None:
+        return
+    reported: set[KeyPath] = set()
+    for motion in plan.task.motions(plan.task_config, *start_of_sensor(plan)):
+        if (
+            isinstance(motion, PlannedTime)
+            and not (motion.by_model and not _has_model(plan))
+            and motion.takes_s > motion.allowed_s * _SLACK
+            and motion.key not in reported
+        ):
+            reported.add(motion.key)
+            takes = f"takes {motion.takes_s:.3g} s at least" if math.isfinite(motion.takes_s) else "never ends"
+            yield file.problem(
+                ("task", *motion.key),
+                f"{motion.allowed_s:g} s, but it {takes} {motion.what}",
+                value=motion.allowed_s,
+                hint="allow more time, go faster, or go less far",
+            )
+
+
+def _has_model(plan: CellPlan) -> bool:
+    """Return whether a model estimates the contacts of any sensor."""
+    return any(hasattr(plan.cell.sensors[name].estimator, "model") for name in plan.sensor_roles.values())
+
+
+def _ages(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
+    """Frames that are older when they come than the task takes."""
+    most_ms = getattr(plan.task_config, "max_frame_age_ms", None)
+    if most_ms is None:
+        return
+    for device in plan.sensors.values():
+        latency_ms, cycle_ms = float(getattr(device.config, "latency_ms", 0.0)), 1e3 / plan.cell.rate_hz
+        if most_ms < latency_ms + cycle_ms:
+            yield file.problem(
+                ("task", "max_frame_age_ms"),
+                f"frames of {device.name!r} come after {latency_ms:g} ms, and a cycle takes {cycle_ms:g} ms",
+                value=most_ms,
+                hint="allow frames of some cycles more",
+            )
+            return
+
+
+def _gates(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
+    """Gates that see no contact before the depth at which an interlock has to see one."""
+    limits = limits_of(plan, "depth", "limit_mm")
+    for name in plan.sensor_roles.values() if limits else ():
+        rule, limit_mm = min(limits.items(), key=lambda each: each[1])
+        touch_percent = getattr(getattr(plan.cell.sensors[name].estimator, "gate", None), "touch_percent", 0.0)
+        if touch_percent >= CHANGE_PERCENT_PER_MM * limit_mm:
+            yield file.problem(
+                ("sensors", name, "estimator", "gate", "touch_percent"),
+                f"a contact begins at about {touch_percent / CHANGE_PERCENT_PER_MM:.2g} mm of depth, "
+                f"which is not below the limit of interlocks.{rule}, {limit_mm:g} mm",
+                value=touch_percent,
+                hint="e.g. 4",
+            )
+
+
+def _too_light(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
+    """Depths that are to be held although the gate calls them no contact; and gates that any noise opens."""
+    for name in plan.sensor_roles.values():
+        gate = getattr(plan.cell.sensors[name].estimator, "gate", None)
+        touch_percent, release_percent = (getattr(gate, f"{each}_percent", None) for each in ("touch", "release"))
+        if touch_percent is None or release_percent is None:
+            continue
+        if touch_percent < _LEAST_TOUCH_PERCENT:
+            yield file.problem(
+                ("sensors", name, "estimator", "gate", "touch_percent"),
+                "less than a quarter of a grey level: noise alone would be a contact",
+                value=touch_percent,
+                hint="e.g. 4",
+            )
+        least_mm = _LIGHTEST * release_percent / CHANGE_PERCENT_PER_MM
+        for key, depth_mm in demands(plan.task_config, "depth"):
+            if key[-1] == "depth_mm" and "until" not in key and depth_mm < least_mm:
+                yield file.problem(
+                    ("task", *key),
+                    f"{depth_mm:g} mm is no contact to the gate of {name!r}, which ends it at about "
+                    f"{release_percent / CHANGE_PERCENT_PER_MM:.2g} mm",
+                    value=depth_mm,
+                    hint="press deeper",
+                )
+
+
+def _gains(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
+    """Gains with which a correction overshoots by more than the error, from one control cycle to the next."""
+    for at, config in (((), plan.task_config), (("follower",), getattr(plan.task_config, "follower", None))):
+        gains = getattr(config, "kp_per_s", None)
+        if gains is not None and max(gains) >= 2.0 * plan.cell.rate_hz:
+            yield file.problem(
+                ("task", *at, "kp_per_s"),
+                f"{max(gains):g} per s overshoots by more than the error in a cycle of {1e3 / plan.cell.rate_hz:g} ms",
+                value=gains,
+                hint=f"well below {plan.cell.rate_hz:g} per s",
+            )
+
+
+def _pressing(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
+    """Speeds towards a first touch from which no arm of the task stops before the depth limit."""
+    limits = limits_of(plan, "depth", "limit_mm")
+    if plan.task.motions is None or not limits:
+        return
+    rule, limit_mm = min(limits.items(), key=lambda each: each[1])
+    arms = (getattr(device.config, "limits", None) for device in plan.arms.values())
+    accel_m_s2 = max((each.tcp_accel_m_s2 for each in arms if isinstance(each, LimitsConfig)), default=math.inf)
+    latencies_ms = [float(getattr(device.config, "latency_ms", 0.0)) for device in plan.sensors.values()]
+    reported: set[KeyPath] = set()
+    for motion in plan.task.motions(plan.task_config, *start_of_sensor(plan)):
+        if not isinstance(motion, PlannedStart) or not motion.presses or motion.key in reported:
+            continue
+        braking_m = motion.speed_m_s * (1e-3 * min(latencies_ms, default=0.0) + 0.5 * motion.speed_m_s / accel_m_s2)
+        if 1e3 * braking_m >= limit_mm:
+            reported.add(motion.key)
+            yield file.problem(
+                ("task", *motion.key),
+                f"at {1e3 * motion.speed_m_s:g} mm/s the tip gets {1e3 * braking_m:.1f} mm deep before it stands, "
+                f"not below the limit of interlocks.{rule}, {limit_mm:g} mm",
+                value=1e3 * motion.speed_m_s,
+                hint="go slower where something is to be touched",
+            )
+
+
+def _unmet(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
+    """Ways on which something has to be touched, and nothing is there."""
+    if plan.cell.scene is None:
+        return
+    scene = scene_section().model_validate(plan.cell.scene)
+    reach_mm = getattr(plan.task_config, "approach_distance_mm", None)
+    if reach_mm is not None:
+        for name in plan.sensor_roles.values():
+            tip = _tip(plan, name)
+            if tip is not None and not scene.meets(tip, (1e-3 * reach_mm + _REACH_SLACK_M) * tip[:3, 2]):
+                yield file.problem(
+                    ("task", "approach_distance_mm"),
+                    f"the tip of {name!r} meets nothing within that distance along its axis from its start",
+                    value=reach_mm,
+                    hint="start nearer to the surface and turned towards it, or search farther",
+                )
+    if plan.task.motions is None or not plan.sensor_roles:
+        return
+    name = plan.sensor_roles[min(plan.sensor_roles)]
+    reported: set[KeyPath] = set()
+    for motion in plan.task.motions(plan.task_config, *start_of_sensor(plan)):
+        if not isinstance(motion, PlannedTouch) or motion.key in reported:
+            continue
+        tip = _tip(plan, name, motion.T_base_tcp)
+        arm = plan.cell.sensors[name].mounted_on
+        base = None if arm is None else pose_of(plan.cell.arms[arm].base_pose_mm_deg)
+        if tip is not None and base is not None and not scene.meets(tip, base[:3, :3] @ motion.way_m, motion.depth_m):
+            reported.add(motion.key)
+            wanted = f"{1e3 * motion.depth_m:g} mm deep" if motion.depth_m else "at all"
+            yield file.problem(
+                ("task", *motion.key),
+                f"touches nothing {wanted} on this way, which the step waits for",
+                hint="go farther, or the other way",
+            )
+
+
+def _tip(plan: CellPlan, sensor: str, T_base_tcp: Array | None = None) -> Array | None:
+    """Return the pose (4, 4) of a sensor in the world, at the start or with the tool at a pose; None if unknown."""
+    section = plan.cell.sensors[sensor]
+    if section.mounted_on is None:
+        return None
+    T = start_of_arm(plan, section.mounted_on) if T_base_tcp is None else T_base_tcp
+    base = pose_of(plan.cell.arms[section.mounted_on].base_pose_mm_deg)
+    return None if T is None or base is None else base @ T @ section.T_tcp_sensor
+
+
+def _untouched(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
+    """Steps that hold a contact before anything is touched."""
+    if plan.task.motions is None or not plan.sensor_roles:
+        return
+    name = plan.sensor_roles[min(plan.sensor_roles)]
+    arm = plan.cell.sensors[name].mounted_on
+    base = None if arm is None else pose_of(plan.cell.arms[arm].base_pose_mm_deg)
+    _, mount = start_of_sensor(plan)
+    reported: set[KeyPath] = set()
+    for motion in plan.task.motions(plan.task_config, *start_of_sensor(plan)):
+        if not isinstance(motion, PlannedHold) or motion.key in reported:
+            continue
+        after = motion.after
+        if not after and plan.cell.scene is not None and motion.T_base_tcp is not None and base is not None:
+            scene = scene_section().model_validate(plan.cell.scene)
+            tip = base @ motion.T_base_tcp @ mount
+            after = "" if scene.touches(tip) else f"standing clear of the scene with {name!r}"
+        if after:
+            reported.add(motion.key)
+            yield file.problem(
+                ("task", *motion.key),
+                f"holds a contact, and there is none after {after}: it would trip for lack of one",
+                hint="touch first, e.g. {move: {by_mm_deg: [0, 0, 30], until: {contact: true}}}",
+            )
