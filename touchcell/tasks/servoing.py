@@ -24,8 +24,8 @@ ARM: Final = "arm"
 """Role of the arm in tasks with one arm."""
 SENSOR: Final = "sensor"
 """Role of the tactile sensor that it carries."""
-_SIDESTEP_S: Final = 30.0
-"""Longest motion beside an object; six touches of an edge take 15 s."""
+_SIDESTEP_S: Final = 60.0
+"""Longest motion beside an object; eight touches of each edge take 40 s."""
 _RETURN_S: Final = 10.0
 """Longest return to where a contact was lost; the way is that of a few frames."""
 
@@ -362,7 +362,7 @@ class ServoTask(MachineTask):
                     self._post("missed", astray)
                 elif any(finished):
                     shortfalls = [servo.run.shortfall() for servo in servos]
-                    if missed := next(filter(None, shortfalls), ""):
+                    if missed := "; ".join(filter(None, shortfalls)):
                         self._post("missed", missed)
                     else:
                         self._post("finished")
