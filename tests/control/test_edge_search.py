@@ -100,4 +100,5 @@ def test_the_distance_between_two_edges_is_told_whatever_was_expected() -> None:
     other = first.opposite()
     other.touched(Contact(0.0, -0.03, 0.3))
     found, width_m = first.between(other)
-    assert (found.y_m, width_m) == (pytest.approx(0.005), pytest.approx(0.07))
+    assert found.y_m == pytest.approx(0.005)
+    assert width_m == pytest.approx(0.07)

@@ -68,8 +68,10 @@ _LEAST_APART_M: Final = 0.006
 """... and nearer ones do not tell how it is turned."""
 _FLAT_RAD: Final = math.radians(3.0)
 """Turn of the normal between them from which a side is not flat."""
-_BULGE_M: Final = 2.5e-3
-"""Height of a side over the line between its edges from which it is not flat."""
+_BULGE_M: Final = 0.5e-3
+"""Height of a side over the line between its edges from which it is not flat ..."""
+_BULGE: Final = 0.06
+"""... where it is this share of half that line, too: tan(theta / 2) of a round side whose normals turn by theta."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -335,6 +337,12 @@ class PredictivePush:
                 found, sigma_m = one.middle, _EDGE_SIGMA_M if is_told else sigma_m
                 break
             found, felt_m = one.between(other)
+            bulge_m = -_pose_of(found).local((side.x_m, side.y_m))[0]
+            # A first contact with an edge, whose normal is not the side's, tells nothing of it.
+            of_side = abs(math.remainder(side.heading_rad - found.heading_rad, 2.0 * math.pi)) < _SIDE_SIGMA_RAD
+            if of_side and bulge_m > max(_BULGE_M, 0.5 * _BULGE * felt_m):
+                self.misfit = f"the touched side bulges by {1e3 * bulge_m:.1f} mm: it is not flat (`sides: round`?)"
+                return found, sigma_m
             sigma_m = max(_EDGES_SIGMA_M, 0.5 * abs(felt_m - width_m))
             if not is_told or sigma_m < 0.5 * _WIDTH_M:
                 found = yield from self._straightened(T_base_sensor, found, 0.5 * felt_m)
