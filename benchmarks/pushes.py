@@ -1,19 +1,21 @@
 """``python -m benchmarks pushes``: whether a push that says done has brought its object to the target.
 
-    python -m benchmarks --out bench pushes [--rigs 60] [--map]
+    python -m benchmarks --out bench pushes [--rigs 60] [--seeds 2 24 29] [--map]
 
 Each rig is one of the experiments' prisms on one of their tables, pushed by one arm or by two, with truth sampled apart
 from what is told: start to 20 mm and 20 deg off, mass to 50 % and friction to 30 % off, the centre of mass to 10 mm
 beside the middle in every second rig, another tip than the network's, mount, latencies and arm lag. A false done is a
-push that says done and whose object is farther from its target than the task's tolerance. The map shows the object's
-error over start offset and angle, on the true contact. An interrupted call goes on where it stopped.
+push that says done and whose object is farther from its target than the task's tolerance. The maps (``--map``, with
+``--rigs 0`` alone) show the object's error over start offset and angle with one arm and with two, over friction and
+mass, and over speed and target, with the shipped network on another tip than it knows, quasi-static. An interrupted
+call goes on where it stopped.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -37,8 +39,68 @@ from touchcell.cell.experiments.trials import Finished, Perform, Trial
 from touchcell.simulation.objects import TABLES
 
 _TOLERANCE_MM: Final = 5.0
-_OFFSETS_MM: Final = (-20, -10, 0, 10, 20)
-_TURNS_DEG: Final = (-20, -10, 0, 10, 20)
+_TIP: Final = "franka_tactip_1"
+"""The tip fitted to a real sensor's images, which the shipped network does not know."""
+
+
+@dataclass(frozen=True, slots=True)
+class Map:
+    """Errors of one push over two things that vary.
+
+    Attributes:
+        name: title of the picture.
+        arms: that push.
+        x, y: what varies, with units.
+        xs, ys: their values.
+        changes: returns keys of the cell for one of each, and the truth of the object.
+    """
+
+    name: str
+    arms: Arms
+    x: str
+    y: str
+    xs: tuple[float, ...]
+    ys: tuple[float, ...]
+    changes: Callable[[float, float], tuple[dict[str, Any], dict[str, Any]]]
+
+
+def _start(offset_mm: float, turn_deg: float) -> tuple[dict[str, Any], dict[str, Any]]:
+    return {}, {"pose_offset_mm_deg": [5, offset_mm, 0, 0, 0, turn_deg]}
+
+
+def _load(friction: float, mass_percent: float) -> tuple[dict[str, Any], dict[str, Any]]:
+    mass_g = 0.01 * mass_percent * PRISMS[0].mass_g
+    return {}, {"friction": friction, "mass_g": mass_g, "pose_offset_mm_deg": [5, 8, 0, 0, 0, 8]}
+
+
+def _course(speed_mm_s: float, aside_mm: float) -> tuple[dict[str, Any], dict[str, Any]]:
+    keys = {"task.push_speed_mm_s": speed_mm_s, "task.target_mm": [300, aside_mm]}
+    return keys, {"pose_offset_mm_deg": [5, 8, 0, 0, 0, 8]}
+
+
+_STARTS: Final = (-20.0, -10.0, 0.0, 10.0, 20.0)
+MAPS: Final = (
+    Map("start, one arm", ONE_ARM, "mm aside", "deg turned", _STARTS, _STARTS, _start),
+    Map("start, two arms", TWO_ARMS, "mm aside", "deg turned", _STARTS, _STARTS, _start),
+    Map(
+        "load, one arm",
+        ONE_ARM,
+        "friction (told: 0.3)",
+        "mass, % of what is told",
+        (0.15, 0.3, 0.45, 0.6, 0.75),
+        (50.0, 75.0, 100.0, 125.0, 150.0),
+        _load,
+    ),
+    Map(
+        "course, one arm",
+        ONE_ARM,
+        "speed, mm/s",
+        "target, mm aside",
+        (20.0, 50.0, 80.0, 100.0, 120.0),
+        (-120.0, -60.0, 0.0, 60.0, 120.0),
+        _course,
+    ),
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,13 +148,14 @@ def _standing(pushed: Pushed) -> dict[str, Any]:
     return {OBJECT: section}
 
 
-def map_trial(arms: Arms, offset_mm: float, turn_deg: float) -> Trial:
-    """Return the run at one point of the map."""
+def map_trial(of: Map, x: float, y: float) -> Trial:
+    """Return the run at one point of a map."""
     pushed = PRISMS[0]
-    changes = arms.around(pushed, "mdf", PUSH_HEIGHT_MM) | arms.sampling(pushed, "mdf")
-    changes |= arms.estimating("true contact") | {"scene.physics": "quasi_static", "scene.objects": _standing(pushed)}
-    changes["truth"] = {"objects": {OBJECT: {"pose_offset_mm_deg": [5, offset_mm, 0, 0, 0, turn_deg]}}}
-    return Trial(f"map{len(arms.sensors)}_{offset_mm:g}_{turn_deg:g}", arms.name, arms.cell, changes)
+    keys, truth = of.changes(x, y)
+    changes = of.arms.around(pushed, "mdf", PUSH_HEIGHT_MM) | of.arms.sampling(pushed, "mdf")
+    changes |= {"scene.physics": "quasi_static", "scene.objects": _standing(pushed)} | keys
+    changes["truth"] = {"objects": {OBJECT: truth}, "sensors": {sensor: {"tip": _TIP} for sensor in of.arms.sensors}}
+    return Trial(f"map_{of.name.replace(', ', '_').replace(' ', '_')}_{x:g}_{y:g}", of.name, of.arms.cell, changes)
 
 
 def verdict(finished: Finished) -> str:
@@ -106,16 +169,22 @@ def run(arguments: Sequence[str], out: Path) -> None:
     """Print a line for each rig and the table; write ``pushes.txt``, ``pushes.json`` and the map's picture."""
     parser = argparse.ArgumentParser(prog="pushes", description=__doc__.partition("\n")[0])
     parser.add_argument("--rigs", type=int, default=60)
-    parser.add_argument("--map", action="store_true", help="draw the map, too")
+    parser.add_argument("--seeds", type=int, nargs="*", help="these rigs in place of the first")
+    parser.add_argument("--map", action="store_true", help="draw the maps, too")
     options = parser.parse_args(arguments)
     perform = Perform(push_measures, out / "pushes")
-    rigs = [rig(seed) for seed in range(options.rigs)]
+    rigs = [rig(seed) for seed in options.seeds or range(options.rigs)]
+    if rigs:
+        _rigs(perform, rigs, out)
+    if options.map:
+        _draw_maps(perform, out)
+
+
+def _rigs(perform: Perform, rigs: Sequence[Rig], out: Path) -> None:
     ended: dict[int, Finished] = {}
     for each in rigs:
         ended[each.seed] = _performed(perform, each.trial)
-        print(
-            f"{each.seed + 1:>3}/{len(rigs)}  {each.pushed.name:<13}{_line(each.group, ended[each.seed])}", flush=True
-        )
+        print(f"{len(ended):>3}/{len(rigs)}  {each.pushed.name:<13}{_line(each.group, ended[each.seed])}", flush=True)
     lines = table(rigs, ended)
     print("\n".join(lines))
     text = [f"{key}: {value}" for key, value in provenance().items()]
@@ -133,8 +202,6 @@ def run(arguments: Sequence[str], out: Path) -> None:
         for each in rigs
     ]
     (out / "pushes.json").write_text(json.dumps({"provenance": provenance(), "rigs": rows}, indent=1) + "\n")
-    if options.map:
-        _draw_maps(perform, out)
 
 
 def _performed(perform: Perform, trial: Trial) -> Finished:
@@ -168,24 +235,25 @@ def _draw_maps(perform: Perform, out: Path) -> None:
     from matplotlib import pyplot as plt
     from matplotlib.colors import LogNorm
 
-    figure, axes = plt.subplots(1, 2, figsize=(11, 4.6), layout="constrained", sharey=True)
-    for ax, arms in zip(axes, (ONE_ARM, TWO_ARMS), strict=True):
-        errors = np.full((len(_TURNS_DEG), len(_OFFSETS_MM)), np.nan)
-        for (i, turn), (j, offset) in product(enumerate(_TURNS_DEG), enumerate(_OFFSETS_MM)):
-            finished = _performed(perform, map_trial(arms, offset, turn))
+    figure, axes = plt.subplots(2, 2, figsize=(11, 8.6), layout="constrained")
+    lines = [f"{key}: {value}" for key, value in provenance().items()] + [""]
+    for ax, each in zip(axes.flat, MAPS, strict=True):
+        errors = np.full((len(each.ys), len(each.xs)), np.nan)
+        for (i, y), (j, x) in product(enumerate(each.ys), enumerate(each.xs)):
+            finished = _performed(perform, map_trial(each, x, y))
             error_mm = finished.measures.get("object_error_mm", np.nan)
-            print(f"map, {arms.name}, {offset} mm, {turn} deg: {verdict(finished)} {error_mm:.2f} mm", flush=True)
+            lines.append(f"{each.name}: {each.x} {x:g}, {each.y} {y:g}: {_line('', finished).strip()}")
+            print(lines[-1], flush=True)
             if finished.done:
                 errors[i, j] = error_mm
-            text = f"{error_mm:.2f}" if finished.done else verdict(finished)
-            ax.text(offset, turn, text, ha="center", va="center", fontsize=8)
-        step = _OFFSETS_MM[1] - _OFFSETS_MM[0]
-        low, high = _OFFSETS_MM[0] - step / 2, _OFFSETS_MM[-1] + step / 2
-        image = ax.imshow(
-            errors, origin="lower", extent=(low, high, low, high), cmap="YlGn_r", norm=LogNorm(0.1, 5.0), alpha=0.8
-        )
-        ax.set(title=arms.name, xlabel="start, mm aside", xticks=_OFFSETS_MM, yticks=_TURNS_DEG)
-    axes[0].set_ylabel("start, deg turned")
+            ax.text(
+                j, i, f"{error_mm:.2f}" if finished.done else verdict(finished), ha="center", va="center", fontsize=8
+            )
+        image = ax.imshow(errors, origin="lower", cmap="YlGn_r", norm=LogNorm(0.1, 5.0), alpha=0.8, aspect="auto")
+        ax.set(title=each.name, xlabel=each.x, ylabel=each.y)
+        ax.set_xticks(range(len(each.xs)), [f"{x:g}" for x in each.xs])
+        ax.set_yticks(range(len(each.ys)), [f"{y:g}" for y in each.ys])
     figure.colorbar(image, ax=axes, label="object from its target, mm (done)")
     figure.savefig(out / "pushes.png", dpi=110)
     plt.close(figure)
+    (out / "pushes_maps.txt").write_text("\n".join(lines) + "\n")

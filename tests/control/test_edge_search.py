@@ -90,14 +90,15 @@ def test_between_both_edges_normals_that_are_misread_and_a_wrong_width_cancel(
             at = Pose(contact.x_m, contact.y_m, middle.heading).ahead(side * inwards_m, 0.5 * math.pi)
             search.touched(Contact(at.x, at.y, middle.heading + 0.92 * angle))
     assert other is not None
-    found = first.between(other)
-    assert found is not None
+    found, _ = first.between(other)
     assert abs(middle.local((found.x_m, found.y_m))[1]) < 0.7e-3
 
 
-def test_edges_that_are_not_as_far_apart_as_they_should_have_no_middle() -> None:
+def test_the_distance_between_two_edges_is_told_whatever_was_expected() -> None:
     first = EdgeSearch(Contact(0.0, 0.0, 0.0), 0.0, 0.08, RADIUS_M)
     first.touched(Contact(0.0, 0.04, -0.3))
     other = first.opposite()
     other.touched(Contact(0.0, -0.03, 0.3))
-    assert first.between(other) is None
+    found, width_m = first.between(other)
+    assert found.y_m == pytest.approx(0.005)
+    assert width_m == pytest.approx(0.07)

@@ -36,7 +36,7 @@ def pushed(folder: Path, interlock: dict[str, Any] | None) -> tuple[RunResult, f
     data["scene"]["objects"]["prism"]["shape"]["size_mm"] = [60, 60, 180]
     data["arms"]["arm"]["start_pose_mm_deg"] = [-55, 0, 165, 180, 0, 0]
     # Its edges are not felt first: high up a foam table lets it turn with the tip.
-    del data["task"]["side_width_mm"]
+    data["task"]["sides"] = "round"
     put_on_true_contact(data)
     for entry in data["interlocks"].values():
         if entry["kind"] == "workspace":

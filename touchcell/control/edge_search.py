@@ -17,16 +17,15 @@ from touchcell.control.push_steering import Pose
 _BEYOND_M: Final = 0.006
 """Distance beyond the expected edge at which it is searched for."""
 _STEP_M: Final = 0.011
-"""Distance to the next attempt: an edge is felt from 1.4 to 13 mm beside the tip's centre."""
+"""Distance to the next attempt, doubled until the edge is between two: it is felt from 1.4 to 13 mm beside the tip's
+centre."""
 _EDGE_RAD: Final = math.radians(4.0)
 """Turn of the normal from which an edge is touched, and not the side."""
 _INWARDS_RAD: Final = math.radians(20.0)
 """Turn of the tip towards the edge's normals: models know tilts to 25 degrees."""
 _APART_M: Final = 0.005
 """Distance of two contacts from which the line through them tells how their side is turned."""
-_MOST_TOUCHES: Final = 6
-_WIDTH_M: Final = 0.004
-"""Largest difference of the width that is felt from the one that is given."""
+_MOST_TOUCHES: Final = 8
 
 
 class EdgeSearch:
@@ -35,7 +34,7 @@ class EdgeSearch:
     Args:
         side: a contact with the side, or, unknown to the caller, with one of its edges.
         expected_m: of the side's middle to the left of that contact.
-        width_m: of the side.
+        width_m: of the side, as it is expected.
         tip_radius_m: radius of the tip.
         left: 1 for the left edge, -1 for the right one; the nearer one without it.
     """
@@ -51,24 +50,23 @@ class EdgeSearch:
         # Outwards: the farthest touch of the side, and the nearest attempt that touched nothing.
         self._flat_m: float | None = None
         self._missed_m: float | None = None
+        self._step_m = _STEP_M
         self._touches = 0
         self._edge = self._side
         self.middle: Contact | None = None
-        """The side's middle; None until the edge has been found."""
+        """The side's middle, by the width that is expected; None until the edge has been found."""
 
     def opposite(self) -> EdgeSearch:
         """Return the search for the other edge, after this one has been found."""
         assert self.middle is not None
         return EdgeSearch(self.middle, 0.0, 2.0 * self._half_m, self._tip_radius_m, left=-self._left)
 
-    def between(self, other: EdgeSearch) -> Contact | None:
-        """Return the middle between the edges of two searches; None where they are not as far apart as they should."""
+    def between(self, other: EdgeSearch) -> tuple[Contact, float]:
+        """Return the middle between the edges that two searches have found, and the distance of these."""
         right, left = (self, other) if other._left > 0.0 else (other, self)
         dx, dy = left._edge.x - right._edge.x, left._edge.y - right._edge.y
-        if other.middle is None or abs(math.hypot(dx, dy) - 2.0 * self._half_m) > _WIDTH_M:
-            return None
         x, y = 0.5 * (left._edge.x + right._edge.x), 0.5 * (left._edge.y + right._edge.y)
-        return Contact(x, y, math.atan2(dy, dx) - 0.5 * math.pi)
+        return Contact(x, y, math.atan2(dy, dx) - 0.5 * math.pi), math.hypot(dx, dy)
 
     @property
     def failed(self) -> bool:
@@ -123,6 +121,6 @@ class EdgeSearch:
             case float(), float():
                 self._at_m = 0.5 * (self._flat_m + self._missed_m)
             case float(), None:
-                self._at_m = self._flat_m + _STEP_M
+                self._at_m, self._step_m = self._flat_m + self._step_m, 2.0 * self._step_m
             case None, float():
-                self._at_m = self._missed_m - _STEP_M
+                self._at_m, self._step_m = self._missed_m - self._step_m, 2.0 * self._step_m

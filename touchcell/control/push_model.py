@@ -36,12 +36,12 @@ _HEADING_NOISE_RAD: Final = math.radians(0.3)
 _OFFSET_PRIOR_M: Final = 0.015
 _LEVER_PRIOR: Final = 0.15
 """Standard deviation of ``c^2`` over its first value."""
-_CREEP_M_PER_SQRT_M: Final = 0.003
-"""Growth of the uncertainty of where an object is touched over travel: contacts creep."""
+_DRIFT_M_PER_SQRT_M: Final = 0.003
+"""Growth of the uncertainty of ``s`` over travel: what presses on the table, and where, changes ..."""
 _FOLLOWED_DRIFT_M_PER_SQRT_M: Final = 0.010
-"""The same of ``s`` where a follower presses, too ..."""
-_FOLLOWED_CREEP_M_PER_SQRT_M: Final = 0.002
-"""... and of the middle: contacts that press opposite each other creep less."""
+"""... and where a follower presses, too."""
+_CREEP_M_PER_SQRT_M: Final = 0.0005
+"""The same of the middle: contacts creep by 0.1 mm in 0.3 m."""
 _FEWEST_M: Final = 0.002
 _SHORTEST_M: Final = 0.005
 """Travel from which a motion is compared with the model."""
@@ -142,13 +142,9 @@ class PushEstimator:
         self._first_lever_m2 = lever_m2
         self._flat = flat
         self._eccentricity_m = max(eccentricity_m, 1e-6)
-        creep = _CREEP_M_PER_SQRT_M**2 if flat else 0.0
-        # Growth of the covariance of offset, lever and middle over travel. Creep moves offset and middle by the same;
-        # from what a follower's force changes the middle must not learn.
-        self._drift = creep * np.array([[1.0, 0.0, 1.0], [0.0, 0.0, 0.0], [1.0, 0.0, 1.0]])
-        if followed:
-            creep = _FOLLOWED_CREEP_M_PER_SQRT_M**2 if flat else 0.0
-            self._drift = np.diag([_FOLLOWED_DRIFT_M_PER_SQRT_M**2, 0.0, creep])
+        drift = _FOLLOWED_DRIFT_M_PER_SQRT_M if followed else _DRIFT_M_PER_SQRT_M
+        # Growth of the covariance of offset, lever and middle over travel.
+        self._drift = np.diag([drift**2, 0.0, _CREEP_M_PER_SQRT_M**2]) if flat or followed else np.zeros((3, 3))
         self._mean = np.array([0.0, lever_m2, 0.0])
         self._covariance = np.diag([0.0, (_LEVER_PRIOR * lever_m2) ** 2, 0.0])
         # Of each contact so far: travel, way to the left in the object's frame, heading.

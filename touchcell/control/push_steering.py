@@ -5,11 +5,13 @@ centre swings out by ``-d`` per turn. Over the distance ``L`` that is left a pat
 to the left by the integral of ``(L - d - x) k`` and turns it by that of ``k``, to first order. Of all paths that
 arrive, the one with the least integral of ``k^2`` has a curvature linear in ``x``, with the value now
 
-    3 y (L - d) / ((L - d)^3 + d^3)                      where the heading at the target is free,
+    3 y (L - d) / ((L - d)^3 + d^3 + r^3)                where the heading at the target is free,
     psi / L + 6 (y - (L / 2 - d) psi) / L^2              where it has to turn by ``psi``,
 
-``y`` being the target's offset to the left. It is planned anew in each cycle: model-predictive control (linear
-dynamics, quadratic cost, a terminal constraint) in closed form. The friction cone bounds the curvature.
+``y`` being the target's offset to the left, and ``r`` a length within which the last tenths of a millimetre are not
+worth the curvature: so near, it would follow the noise of the contact. It is planned anew in each cycle:
+model-predictive control (linear dynamics, quadratic cost, a terminal constraint) in closed form. The friction cone
+bounds the curvature.
 """
 
 from __future__ import annotations
@@ -22,7 +24,9 @@ from touchcell.control.path import Point
 from touchcell.control.push_model import PushModel
 
 _SHORTEST_M: Final = 0.012
-"""Way below which the curvature is kept: noise would prevail."""
+"""Way below which the object goes straight: noise would prevail, and each turn swings its centre aside."""
+_CALM_M: Final = 0.012
+"""The length r."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,9 +71,7 @@ class Plan:
         return abs(self.wanted - self.curvature) > 1e-9
 
 
-def steer(
-    center: Pose, model: PushModel, target: Point, goal_heading: float | None, friction: float, kept: float = 0.0
-) -> Plan:
+def steer(center: Pose, model: PushModel, target: Point, goal_heading: float | None, friction: float) -> Plan:
     """Return the plan that takes an object's centre to the target.
 
     Args:
@@ -78,7 +80,6 @@ def steer(
         target: where the object's middle is to arrive.
         goal_heading: of the contact normal there, rad; None where it is free.
         friction: slope of the friction cone that may be used.
-        kept: curvature to keep where the target is too near to steer.
     """
     lowest, highest = model.curvatures(friction)
     # The centre, moving as the unicycle does: parallel to it while the path is straight, and swinging behind it.
@@ -89,9 +90,9 @@ def steer(
     ahead, left = moving.local((beside.x, beside.y))
     length, swing = math.hypot(ahead, left), model.lead_m * math.cos(model.drift_rad)
     if ahead < _SHORTEST_M:
-        wanted = kept
+        wanted = 0.0
     elif goal_heading is None:
-        wanted = 3.0 * left * (length - swing) / ((length - swing) ** 3 + swing**3)
+        wanted = 3.0 * left * (length - swing) / ((length - swing) ** 3 + swing**3 + _CALM_M**3)
     else:
         turn = math.remainder(goal_heading - center.heading, 2.0 * math.pi)
         wanted = turn / length + 6.0 * (left - (0.5 * length - swing) * turn) / length**2

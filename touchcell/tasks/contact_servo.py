@@ -11,6 +11,7 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat
 
 from touchcell.control.pid import PidGains
 from touchcell.control.servo import TactileServo
+from touchcell.control.touch_zero import TouchZero
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 from touchcell.perception.features.feature_model import TouchedFeature
@@ -110,6 +111,15 @@ class Easing(Protocol):
     @property
     def ease_m(self) -> float:
         """Depth by which it presses less now."""
+        ...
+
+
+@runtime_checkable
+class DepthAware(Protocol):
+    """Behavior that needs the depth of its contact better than a model reads it."""
+
+    def correct_depth(self, error_m: float) -> None:
+        """Take note that a model reads a depth which is larger by ``error_m`` than the arm's own motion says."""
         ...
 
 
@@ -229,6 +239,8 @@ class ContactServo:
         self.sidestepping_run = run if isinstance(run, Sidestepping) else None
         self.feature_run = run if isinstance(run, NeedsFeature) else None
         self._easing_run = run if isinstance(run, Easing) else None
+        self._depth_run = run if isinstance(run, DepthAware) else None
+        self._touch_zero: TouchZero | None = None
         self._config = config
         self._T_tcp_sensor = context.T_tcp_sensor[sensor]
         self._running_axes = None if all(running_axes) else np.array(running_axes, np.float64)
@@ -345,6 +357,20 @@ class ContactServo:
             self._felt = self.T_base_sensor
         if self.contact is not None:
             self._watch_touch()
+        if self._touch_zero is not None and arm is not None and self.T_base_sensor is not None:
+            self._compare_depth(self._touch_zero, arm.t_ns, self.T_base_sensor)
+
+    def _compare_depth(self, zero: TouchZero, t_ns: int, T_base_sensor: Array) -> None:
+        zero.moved(t_ns, T_base_sensor)
+        contact = self.contact
+        if contact is None or contact.change is None or self._depth_run is None:
+            return
+        valid = contact.in_contact and contact.in_range and contact.measured is not None
+        zero.saw(contact.t_frame_ns, contact.seq, contact.change, self.T_s_f_measured if valid else None)
+        if zero.error_m is not None:
+            self._depth_run.correct_depth(zero.error_m)
+        if zero.ended:
+            self._touch_zero = None
 
     def aim_back(self, lift_m: float) -> None:
         """Aim at the pose in which the contact was last felt, withdrawn along the sensor's axis by ``lift_m``."""
@@ -371,6 +397,7 @@ class ContactServo:
     def start_approach(self) -> None:
         """Measure the travelled distance from the current pose, from which the sensor approaches."""
         self.reset_travel()
+        self._touch_zero = None if self._depth_run is None else TouchZero()
         if self.sidestepping_run is not None and self.T_base_sensor is not None:
             self.sidestepping_run.begin_approach(self.T_base_sensor)
 

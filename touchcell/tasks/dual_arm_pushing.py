@@ -20,6 +20,7 @@ from touchcell.tasks.contact_servo import ContactServo, ContactServoConfig, Six,
 from touchcell.tasks.free_motion import Goal, heading_of, placed
 from touchcell.tasks.interface import CONTACT_DEPTH, TaskContext, TaskSpec
 from touchcell.tasks.predictive_push import PredictivePush, twist_in_sensor
+from touchcell.tasks.push_bounds import PushBounds
 from touchcell.tasks.servoing import ServoConfig, ServoTask, servo_motions
 from touchcell.tasks.single_arm_pushing import Push, PushConfig
 
@@ -80,11 +81,14 @@ class Follow:
     Args:
         config: parameters.
         push: the leader's behavior.
+        bounds: of the follower.
         T_leader_follower: pose (4, 4) of the follower's base in the leader's.
     """
 
-    def __init__(self, config: DualArmPushingConfig, push: Push, T_leader_follower: Array) -> None:
+    def __init__(self, config: DualArmPushingConfig, push: Push, bounds: PushBounds, T_leader_follower: Array) -> None:
         self._push = push
+        self._bounds = bounds
+        self._at_limit = ""
         self._active = config.follower.active
         self._T_leader_follower = T_leader_follower
         self._speed_m_s = 1e-3 * config.push_speed_mm_s
@@ -133,10 +137,11 @@ class Follow:
         return float("inf")
 
     def update(self, dt_s: float, before: Array, now: Array, T_s_f: Array | None) -> bool:
-        """Return False: it never finishes by itself."""
+        """Return True only at a limit: the leader decides when the object has arrived."""
         self._y_is_left = -float(np.sign(now[2, 0]))
         self._T_base_sensor = now
-        return False
+        self._at_limit = self._bounds.reached(dt_s, before, now, T_s_f)
+        return bool(self._at_limit)
 
     @property
     def may_sidestep(self) -> bool:
@@ -178,8 +183,8 @@ class Follow:
         yield Goal(T_follower_leader @ T)
 
     def shortfall(self) -> str:
-        """Return nothing: the leader decides."""
-        return ""
+        """Return the limit that has been reached; empty where the leader decides."""
+        return self._at_limit
 
     def telemetry(self) -> Mapping[str, float]:
         """Return no further telemetry."""
@@ -188,10 +193,11 @@ class Follow:
 
 def build(config: DualArmPushingConfig, context: TaskContext) -> ServoTask:
     """Build the task for a cell that has ``leader`` and ``follower`` with a sensor each."""
-    push, hold = Push(config, followed=True), config.follower
+    push, hold = Push(config, PushBounds(context, LEADER, LEADER_SENSOR), followed=True), config.follower
     leader = ContactServo(LEADER, LEADER_SENSOR, config, config.reference_mm_deg, push, context)
     bases = [context.T_world_base.get(arm, np.eye(4)) for arm in (LEADER, FOLLOWER)]
-    follow = Follow(config, push, se3.compose(se3.inverse(bases[0]), bases[1]))
+    bounds = PushBounds(context, FOLLOWER, FOLLOWER_SENSOR)
+    follow = Follow(config, push, bounds, se3.compose(se3.inverse(bases[0]), bases[1]))
     follower = ContactServo(FOLLOWER, FOLLOWER_SENSOR, hold, hold.reference_mm_deg, follow, context)
     return ServoTask("dual_arm_pushing", config, context, leader, follower)
 

@@ -6,6 +6,7 @@ supervisor, and sends what it allows. So every task is tested with plain data an
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final, Generic, Literal, Protocol, TypeAlias, TypeVar
@@ -152,6 +153,21 @@ class Box:
     max_m: Array
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Cone:
+    """Where an axis of an arm's tool may point, in the frame of the arm's base.
+
+    Attributes:
+        axis_tcp: (3,) the axis in the tool frame, of length 1.
+        direction: (3,) axis of the cone in the base frame, of length 1.
+        limit_rad: half of its opening.
+    """
+
+    axis_tcp: Array
+    direction: Array
+    limit_rad: float
+
+
 @dataclass(frozen=True, slots=True)
 class TaskContext:
     """Properties of the cell that a task needs.
@@ -164,6 +180,9 @@ class TaskContext:
         T_world_base: pose (4, 4) of each arm's base, by role; one that is not named stands at the world's origin.
         carriers: role of the arm that carries each sensor role; a sensor that nothing moves is missing.
         boxes: workspaces of each arm role that has any.
+        cones: limits on the tilt of each arm role that has any.
+        max_depth_m: smallest limit on the indentation of any sensor.
+        max_shear_m: smallest limit on its shear.
     """
 
     rate_hz: float
@@ -173,6 +192,9 @@ class TaskContext:
     T_world_base: Mapping[str, Array] = field(default_factory=dict)
     carriers: Mapping[str, str] = field(default_factory=dict)
     boxes: Mapping[str, tuple[Box, ...]] = field(default_factory=dict)
+    cones: Mapping[str, tuple[Cone, ...]] = field(default_factory=dict)
+    max_depth_m: float = math.inf
+    max_shear_m: float = math.inf
 
 
 TaskConfigT = TypeVar("TaskConfigT", bound=TaskConfig)

@@ -4,7 +4,7 @@ in each cycle, and the tip's feedforward is the motion that takes the object alo
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -37,18 +37,20 @@ _STEERED_M: Final = 0.05
 """Way to the target above which that is judged."""
 _RESERVED: Final = 0.8
 """Share of the tip's limits that steering may use."""
-_DELAY_S: Final = 0.02
+_DELAY_S: Final = 0.005
 """From a decision to the arm's standstill beyond its deceleration."""
 _CLEAR_M: Final = 0.008
 """Distance by which a sensor lets go of an object before it steps aside."""
-_EDGE_SIGMA_M: Final = 0.5e-3
-"""Uncertainty of a side's middle by the touch of an edge ..."""
+_NEAR_M: Final = 0.004
+"""The same beside a side whose edges have been felt."""
+_EDGE_SIGMA_M: Final = 1.5e-3
+"""Uncertainty of a side's middle by the touch of one edge and a width that nothing has shown to be right ..."""
 _EDGES_SIGMA_M: Final = 0.3e-3
-"""... and of both."""
+"""... and of both edges."""
+_WIDTH_M: Final = 0.004
+"""Difference of the width that is felt from the one that is expected beyond which both edges are felt again."""
 _ECCENTRIC_M: Final = 0.006
-"""Standard deviation of the centre of friction from a middle that is felt ..."""
-_CENTRIC_M: Final = 0.001
-"""... and from one that is not: motion alone cannot tell them apart."""
+"""Standard deviation of the centre of friction from the middle."""
 _FOLLOWED_M: Final = 0.010
 """What a follower's force adds to it."""
 _REACH_SIGMA_M: Final = 0.3e-3
@@ -56,6 +58,20 @@ _REACH_SIGMA_M: Final = 0.3e-3
 _SIDE_SIGMA_RAD: Final = math.radians(2.5)
 """Turn of the normal from one touch of a side to the next beyond which the first was none of that side."""
 _MOST_SEARCHES: Final = 2
+_ERROR_SHARE: Final = 0.15
+"""Share of a cycle's reading in the mean error of the heading."""
+_FROM_EDGE_M: Final = 0.012
+"""Distance of touches of a side from its edges ..."""
+_FARTHEST_APART_M: Final = 0.025
+"""... and from its middle: farther ones tell no more ..."""
+_LEAST_APART_M: Final = 0.006
+"""... and nearer ones do not tell how it is turned."""
+_FLAT_RAD: Final = math.radians(3.0)
+"""Turn of the normal between them from which a side is not flat."""
+_BULGE_M: Final = 0.5e-3
+"""Height of a side over the line between its edges from which it is not flat ..."""
+_BULGE: Final = 0.06
+"""... where it is this share of half that line, too: tan(theta / 2) of a round side whose normals turn by theta."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +92,7 @@ class PredictivePushSettings:
         look_ahead_m: along paths with waypoints.
         goal_heading_rad: of the contact normal at the target; None where it is free.
         recontact_m: the object is touched anew nearer to its centre where it is pushed farther beside it; None never.
-        side_width_m: width of a flat side, an edge of which is felt before the push; None where it is not.
+        side_width_m: width of a flat side, whose edges are felt before the push; None where it is not known.
         followed: True where a follower presses against the far side.
     """
 
@@ -140,13 +156,11 @@ class PredictivePush:
         self._route = route
         self._has_waypoints = has_waypoints
         reach_m = settings.lead_m - settings.tip_radius_m
-        felt = not settings.flat or settings.side_width_m is not None
-        eccentricity_m = _ECCENTRIC_M if felt else _CENTRIC_M
         self._estimator = PushEstimator(
             reach_m,
             settings.lever_m2,
             flat=settings.flat,
-            eccentricity_m=math.hypot(eccentricity_m, _FOLLOWED_M if settings.followed else 0.0),
+            eccentricity_m=math.hypot(_ECCENTRIC_M, _FOLLOWED_M if settings.followed else 0.0),
             followed=settings.followed,
         )
         self._path: Path | None = None
@@ -155,7 +169,7 @@ class PredictivePush:
         self._start_middle_m = 0.0
         self._sidesteps = 0
         self._searches = 0
-        self._has_edge = settings.flat and settings.side_width_m is not None
+        self._has_edge = settings.flat
         # Arms that press beside each other turn what they hold.
         self._must_place = self._has_edge or settings.followed
         self._approach: float | None = None
@@ -164,10 +178,19 @@ class PredictivePush:
         self._moves = False
         self._middle: Pose | None = None
         self._resting: tuple[Pose, float] | None = None
+        self._rested: tuple[Pose, float] | None = None
         self._steps: Iterator[Goal] = iter(())
         self._felt: Contact | None = None
         self._speed_m_s = 0.0
         self._plan = Plan(0.0, 0.0, math.inf)
+        self._side_is_felt = False
+        self._side_heading: float | None = None
+        self._heading_error = 0.0
+        self._loaded_m = 0.0
+        self.depth_error_m = 0.0
+        """What a model reads too much of the contact's depth."""
+        self.misfit = ""
+        """Why the object is not what is described; empty where it is, as far as touch tells."""
         self.motion = _STANDING
         self.located: Pose | None = None
         """The object's middle while it rests and will be touched anew, with its heading."""
@@ -284,27 +307,86 @@ class PredictivePush:
         yield Goal(placed(T_base_sensor, at.ahead(-self._settings.tip_radius_m - _CLEAR_M)))
 
     def _feel_edge(self, T_base_sensor: Array, side: Contact) -> Iterator[Goal]:
-        """Search for the edges of the side, and then be opposite the middle."""
-        settings = self._settings
-        assert settings.side_width_m is not None
+        """Search for the edges of the side, and then be opposite its middle."""
+        settings, model = self._settings, self._estimator.model
         self._searches += 1
-        search = EdgeSearch(side, self._estimator.model.middle_m or 0.0, settings.side_width_m, settings.tip_radius_m)
         yield Goal(placed(T_base_sensor, _tip_behind(T_base_sensor, side.heading_rad, _CLEAR_M)))
-        yield from self._feel(T_base_sensor, search)
-        found, sigma_m = search.middle, _EDGE_SIGMA_M
-        if found is not None:
-            other = search.opposite()
-            yield from self._feel(T_base_sensor, other)
-            if (between := search.between(other)) is not None:
-                found, sigma_m = between, _EDGES_SIGMA_M
-        if found is not None:
-            at = Pose(found.x_m, found.y_m, found.heading_rad)
-        else:
-            at = Pose(side.x_m, side.y_m, side.heading_rad).ahead(self._estimator.model.middle_m or 0.0, 0.5 * math.pi)
-            sigma_m = self._estimator.middle_sigma_m
-        middle = at.ahead(self._estimator.model.reach_m)
+        found, sigma_m = yield from self._middle_of(T_base_sensor, side)
+        at = _pose_of(found)
+        self._side_is_felt = sigma_m <= _EDGES_SIGMA_M
+        middle = at.ahead(model.reach_m)
         self._resting, self.located = (middle, sigma_m), middle
         yield Goal(placed(T_base_sensor, at.ahead(-settings.tip_radius_m - _CLEAR_M)))
+
+    def _middle_of(self, T_base_sensor: Array, side: Contact) -> Generator[Goal, None, tuple[Contact, float]]:
+        """Feel both edges of a side; return its middle and the standard deviation of that."""
+        settings = self._settings
+        expected_m = self._estimator.model.middle_m or 0.0
+        at = _pose_of(side).ahead(expected_m, 0.5 * math.pi)
+        found, sigma_m = Contact(at.x, at.y, at.heading), self._estimator.middle_sigma_m
+        told = settings.side_width_m
+        width_m = told or 2.0 * (settings.lead_m - settings.tip_radius_m)
+        for is_told in (told is not None, True):
+            one = EdgeSearch(side, expected_m, width_m, settings.tip_radius_m)
+            yield from self._feel(T_base_sensor, one)
+            if one.middle is None:
+                break
+            other = one.opposite()
+            yield from self._feel(T_base_sensor, other)
+            if other.middle is None:
+                found, sigma_m = one.middle, _EDGE_SIGMA_M if is_told else sigma_m
+                break
+            found, felt_m = one.between(other)
+            bulge_m = -_pose_of(found).local((side.x_m, side.y_m))[0]
+            # A first contact with an edge, whose normal is not the side's, tells nothing of it.
+            of_side = abs(math.remainder(side.heading_rad - found.heading_rad, 2.0 * math.pi)) < _SIDE_SIGMA_RAD
+            if of_side and bulge_m > max(_BULGE_M, 0.5 * _BULGE * felt_m):
+                self.misfit = f"the touched side bulges by {1e3 * bulge_m:.1f} mm: it is not flat (`sides: round`?)"
+                return found, sigma_m
+            sigma_m = max(_EDGES_SIGMA_M, 0.5 * abs(felt_m - width_m))
+            if not is_told or sigma_m < 0.5 * _WIDTH_M:
+                found = yield from self._straightened(T_base_sensor, found, 0.5 * felt_m)
+                return found, _EDGES_SIGMA_M
+            # Either the width is not what was told, or something else was taken for an edge.
+            side, expected_m, width_m = found, 0.0, felt_m
+        return found, sigma_m
+
+    def _straightened(self, T_base_sensor: Array, middle: Contact, half_m: float) -> Generator[Goal, None, Contact]:
+        """Touch a side on both sides of its middle, and return this as the arm's positions there say that it lies.
+
+        Both touches are misread by the same: their normals do not count, nor does what that shifts the edges.
+        """
+        settings, at = self._settings, _pose_of(middle)
+        apart_m = min(half_m - _FROM_EDGE_M, _FARTHEST_APART_M)
+        if apart_m < _LEAST_APART_M:
+            return middle
+        felt = []
+        for left_m in (apart_m, -apart_m):
+            clear = at.ahead(-settings.tip_radius_m - _NEAR_M).ahead(left_m, 0.5 * math.pi)
+            yield Goal(placed(T_base_sensor, clear))
+            yield Goal(placed(T_base_sensor, clear.ahead(2.0 * _NEAR_M)), feels=True)
+            felt.append(self._felt)
+            yield Goal(placed(T_base_sensor, clear))
+        left, right = felt
+        if left is None or right is None:
+            return middle
+        turned = math.remainder(left.heading_rad - right.heading_rad, 2.0 * math.pi)
+        if abs(turned) > _FLAT_RAD:
+            self.misfit = (
+                f"the touched side is turned by {math.degrees(abs(turned)):.0f} deg from one end to the other: "
+            )
+            self.misfit += "it is not flat (`sides: round`?)"
+            return middle
+        heading = math.atan2(left.y_m - right.y_m, left.x_m - right.x_m) - 0.5 * math.pi
+        misread = math.remainder(right.heading_rad + 0.5 * turned - heading, 2.0 * math.pi)
+        if abs(math.remainder(heading - middle.heading_rad, 2.0 * math.pi)) > _SIDE_SIGMA_RAD:
+            return middle
+        # What is misread of the tilt moves the point at which a round tip seems to touch.
+        x, y = 0.5 * (left.x_m + right.x_m), 0.5 * (left.y_m + right.y_m)
+        line = Pose(x, y, heading)
+        aside_m = line.local((middle.x_m, middle.y_m))[1] - settings.tip_radius_m * misread
+        found = line.ahead(aside_m, 0.5 * math.pi)
+        return Contact(found.x, found.y, heading)
 
     def _feel(self, T_base_sensor: Array, search: EdgeSearch) -> Iterator[Goal]:
         """Touch until the search has found its edge or failed."""
@@ -389,6 +471,7 @@ class PredictivePush:
         """Return the object's centre of friction and its middle by the contact, which the estimator then knows too."""
         settings, estimator = self._settings, self._estimator
         heading = heading_of(T_base_sensor[:3, :3] @ T_s_f[:3, 2])
+        heading = self._corrected(heading, -float(T_s_f[:3, 2] @ T_s_f[:3, 3]))
         if settings.flat:
             # {f} sticks to the object, one tip radius behind its side.
             origin = T_base_sensor[:2, :3] @ T_s_f[:3, 3] + T_base_sensor[:2, 3]
@@ -396,10 +479,13 @@ class PredictivePush:
         else:
             depth_m = max(0.0, -float(T_s_f[:3, 2] @ T_s_f[:3, 3]))
             behind = Pose(float(T_base_sensor[0, 3]), float(T_base_sensor[1, 3]), heading).ahead(-depth_m)
-        contact = behind.ahead(settings.tip_radius_m)
+        contact = behind.ahead(settings.tip_radius_m + self.depth_error_m)
         if self._resting is not None:
             self._touch_again(contact, *self._resting)
-            self._resting = self.located = None
+            self._rested, self._resting, self.located = self._resting, None, None
+        elif self._rested is not None and not self._moves and self._side_heading is not None:
+            # Where the contact is beside the middle is known better as the error of its normal is.
+            self._place(contact, *self._rested)
         elif self._contact is None and (middle_m := self._expected_offset_m(heading)):
             estimator.move_contact(middle_m, _EXPECTED_M)
         self._contact = Contact(contact.x, contact.y, heading)
@@ -412,12 +498,31 @@ class PredictivePush:
         self._middle = ahead.ahead(model.middle_m or 0.0, 0.5 * math.pi)
         return ahead.ahead(model.offset_m, 0.5 * math.pi), self._middle
 
+    def _corrected(self, heading: float, depth_m: float) -> float:
+        """Return a heading without the error that shows while the object rests: its side lies between its edges.
+
+        Models misread normals otherwise under load than at a touch, so the error counts as it is when the object
+        begins to move.
+        """
+        if self._resting is not None and self._side_is_felt:
+            self._side_heading, self._heading_error, self._loaded_m = self._resting[0].heading, 0.0, 0.0
+        if self._side_heading is not None and not self._moves and depth_m >= self._loaded_m:
+            error = math.remainder(heading - self._side_heading, 2.0 * math.pi)
+            if abs(error) < _SIDE_SIGMA_RAD:
+                self._heading_error += _ERROR_SHARE * (error - self._heading_error)
+                self._loaded_m = depth_m
+        return heading - self._heading_error
+
     def _touch_again(self, contact: Pose, middle: Pose, sigma_m: float) -> None:
         """Know where the middle is beside a new contact, of an object that has rested meanwhile."""
         turned = math.remainder(contact.heading - middle.heading, 2.0 * math.pi)
         if self._has_edge and abs(turned) > _SIDE_SIGMA_RAD and self._searches < _MOST_SEARCHES:
             # What was touched at first was an edge, or the object has turned.
             self._must_place = True
+        self._place(contact, middle, sigma_m)
+
+    def _place(self, contact: Pose, middle: Pose, sigma_m: float) -> None:
+        """Tell the estimator where a contact is beside a middle that rests."""
         middle_m, sigma_m = contact.local((middle.x, middle.y))[1], math.hypot(sigma_m, _TOUCHED_AGAIN_M)
         if not self._settings.flat:
             middle_m = sigma_m = 0.0
@@ -431,7 +536,7 @@ class PredictivePush:
         left_m = self._path.length_m - along_m
         if self._has_waypoints and left_m > settings.look_ahead_m:
             target, goal = self._path.point(along_m + settings.look_ahead_m), None
-        return steer(center, model, target, goal, settings.friction, self._plan.curvature)
+        return steer(center, model, target, goal, settings.friction)
 
     def _accelerate(self, dt_s: float, remaining_m: float) -> None:
         settings = self._settings
@@ -462,7 +567,13 @@ class PredictivePush:
             "friction_radius_mm": 1e3 * math.sqrt(model.lever_m2),
             "curvature_per_m": self._plan.curvature,
             "push_mm_s": 1e3 * self._speed_m_s,
+            "depth_error_mm": 1e3 * self.depth_error_m,
+            "heading_read_error_deg": math.degrees(self._heading_error),
         }
+
+
+def _pose_of(contact: Contact) -> Pose:
+    return Pose(contact.x_m, contact.y_m, contact.heading_rad)
 
 
 def _tip_behind(T_base_sensor: Array, heading: float, distance_m: float) -> Pose:

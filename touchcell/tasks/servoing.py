@@ -37,8 +37,8 @@ SENSOR: Final = "sensor"
 """Role of the tactile sensor that it carries."""
 CHECKING: Final = "check"
 """State in which a model's estimates are checked; one that has no model is not in it."""
-_SIDESTEP_S: Final = 30.0
-"""Longest motion beside an object; six touches of an edge take 15 s."""
+_SIDESTEP_S: Final = 60.0
+"""Longest motion beside an object; eight touches of each edge take 40 s."""
 _RETURN_S: Final = 10.0
 """Longest return to where a contact was lost; the way is that of a few frames."""
 
@@ -397,7 +397,7 @@ class ServoTask(MachineTask):
             self._post("missed", astray)
         elif any(finished):
             shortfalls = [servo.run.shortfall() for servo in self._servos]
-            if missed := next(filter(None, shortfalls), ""):
+            if missed := "; ".join(filter(None, shortfalls)):
                 self._post("missed", missed)
             else:
                 self._post("finished")

@@ -11,15 +11,17 @@ from pydantic import NonNegativeFloat, PositiveFloat, model_validator
 
 from touchcell.control.alignment import Aim, AlignmentGains, TargetAlignment
 from touchcell.control.path import Point
+from touchcell.drivers.core.protocols import SERVO_ARM
 from touchcell.geometry.types import Array
-from touchcell.tasks.contact_servo import ContactServoConfig, Six, SixGains
+from touchcell.tasks.contact_servo import ContactServo, ContactServoConfig, Six, SixGains
 from touchcell.tasks.free_motion import Goal
-from touchcell.tasks.interface import SPEED
+from touchcell.tasks.interface import SPEED, TaskContext, TaskSpec
 from touchcell.tasks.planned_motions import Impossible, PlannedMotion, PlannedTime
 from touchcell.tasks.planned_places import PlannedPlace
 from touchcell.tasks.predictive_push import PredictivePush, PredictivePushSettings, Progress, twist_in_sensor
+from touchcell.tasks.push_bounds import PushBounds
 from touchcell.tasks.push_path import Obstacle, plan
-from touchcell.tasks.servoing import ARM, ServoConfig, one_arm_task, servo_motions
+from touchcell.tasks.servoing import ARM, SENSOR, ServoConfig, ServoTask, servo_motions
 
 Mm = tuple[float, float]
 _SIGMAS = 2.0
@@ -55,15 +57,16 @@ class PushConfig(ContactServoConfig):
             each cycle (``touchcell.control.push_steering``); ``bearing`` is the paper's controller on the bearing of
             the path, which the keys ``align_*`` set.
         tip_radius_mm: radius of the tip.
-        sides: whether the pushed side is flat, or round so that its normal points at the object's centre.
+        sides: whether the pushed side is flat, or round so that its normal points at the object's centre; a round one
+            that is told flat fails.
         friction_radius_mm: mean distance of the object's bottom from its centre, a first value for the estimate; three
             quarters of the distance from contact to centre without it.
         contact_friction: slope of the friction cone between skin and object that steering may use.
         recontact_mm: where the object is found to be pushed farther than this beside its centre, the arm lets go of it,
             steps aside and touches it again opposite its centre; none: never.
-        side_width_mm: width of the pushed side. With it, an edge of the side is felt before the push, which tells where
-            the object's middle is. Without it nothing tells that of a flat side: the centre of friction, which motion
-            tells, is taken for the middle.
+        side_width_mm: width of the pushed side, at whose edges predictive steering begins to feel for them; twice the
+            way from the contact to the object's centre without it. The edges tell where the object's middle is; motion
+            only tells its centre of friction.
         push_accel_mm_s2: acceleration at the start of a predictive push, and deceleration at its end.
         arrival_speed_mm_s: its speed where it arrives.
         arrival_tolerance_mm: the task is done only if the object's middle, where touch and arm pose put it, ends this
@@ -182,7 +185,7 @@ class SingleArmPushingConfig(PushConfig, ServoConfig):
 class Push:
     """Behavior of pushing: along the contact normal, steered to the target, until it is reached."""
 
-    def __init__(self, config: PushConfig, *, followed: bool = False) -> None:
+    def __init__(self, config: PushConfig, bounds: PushBounds, *, followed: bool = False) -> None:
         self._speed_m_s = 1e-3 * config.push_speed_mm_s
         self._timeout_s = config.push_timeout_s
         self._alignment = config.alignment()
@@ -191,6 +194,8 @@ class Push:
         self._tolerance_m, self._tolerance_deg = 1e-3 * config.arrival_tolerance_mm, config.arrival_tolerance_deg
         self._max_cross_track_m = 1e-3 * config.max_cross_track_mm
         self._lead_m = 1e-3 * config.object_center_offset_mm
+        self._bounds = bounds
+        self._at_limit = ""
         self._aim: Aim | None = None
         self._miss_m = self._sigma_m = 0.0
         self._left_m_s = 0.0
@@ -233,6 +238,11 @@ class Push:
         if self._predictive is not None:
             self._predictive.begin_sidestep(T_base_sensor)
 
+    def correct_depth(self, error_m: float) -> None:
+        """Take note of how much deeper than it is a model reads the contact."""
+        if self._predictive is not None:
+            self._predictive.depth_error_m = error_m
+
     def next_goal(self, T_base_sensor: Array, T_s_f: Array | None) -> Goal | None:
         """Return where the sensor shall go next beside the object; None where it shall touch again."""
         return None if self._predictive is None else self._predictive.next_goal(T_base_sensor, T_s_f)
@@ -251,12 +261,15 @@ class Push:
 
     def update(self, dt_s: float, before: Array, now: Array, T_s_f: Array | None) -> bool:
         """Update the steering; return True at the end of the path, or where the object is too far from it."""
+        self._at_limit = self._bounds.reached(dt_s, before, now, T_s_f)
+        if self._predictive is not None:
+            self._at_limit = self._predictive.misfit or self._at_limit
         if T_s_f is None:
             self._alignment.pause()
             if self._predictive is not None:
                 self._predictive.pause()
             self._left_m_s = 0.0
-            return False
+            return bool(self._at_limit)
         self._y_is_left = -float(np.sign(now[2, 0]))
         self.depth_m = max(0.0, -float(T_s_f[:3, 2] @ T_s_f[:3, 3]))
         if self._predictive is not None:
@@ -265,13 +278,15 @@ class Push:
         else:
             self._aim = self._alignment.aim(now, T_s_f)
             self._left_m_s = self._alignment.step(self._aim, dt_s)
-        return self._aim.remaining_m <= 0.0 or self._strayed(self._aim)
+        return self._aim.remaining_m <= 0.0 or bool(self._at_limit) or self._strayed(self._aim)
 
     def shortfall(self) -> str:
         """Return how far the object ended from its target, or from its path, if that is beyond the tolerances."""
         aim = self._aim
         if aim is None:
-            return ""
+            return self._at_limit
+        if self._at_limit and aim.remaining_m > 0.0:
+            return f"{self._at_limit}; object {1e3 * aim.target_distance_m:.0f} mm from the target"
         if self._miss_m > self._max_cross_track_m:
             return (
                 f"the target cannot be reached: friction turns the object too little, it would pass "
@@ -357,12 +372,21 @@ def _motions(config: SingleArmPushingConfig, T_base_tcp: Array | None, T_tcp_sen
     yield PlannedTime(("push_timeout_s",), takes_s, config.push_timeout_s, "to push so far")
 
 
-SPEC = one_arm_task(
-    "single_arm_pushing",
-    "push an object over a table to a target, steering it by touch",
-    SingleArmPushingConfig,
-    Push,
-    lambda config: config.reference_mm_deg,
-    lambda config, start, mount: config.planned_places(ARM),
-    _motions,
+def build(config: SingleArmPushingConfig, context: TaskContext) -> ServoTask:
+    """Build the task for a cell that has ``arm`` with a sensor."""
+    push = Push(config, PushBounds(context, ARM, SENSOR))
+    servo = ContactServo(ARM, SENSOR, config, config.reference_mm_deg, push, context)
+    return ServoTask("single_arm_pushing", config, context, servo)
+
+
+SPEC = TaskSpec(
+    name="single_arm_pushing",
+    summary="push an object over a table to a target, steering it by touch",
+    config=SingleArmPushingConfig,
+    arms={ARM: SERVO_ARM},
+    sensors=frozenset({SENSOR}),
+    build=build,
+    starts_free=True,
+    places=lambda config, start, mount: config.planned_places(ARM),
+    motions=_motions,
 )

@@ -20,10 +20,11 @@ from touchcell.cell.runtime.devices import build_devices, build_world
 from touchcell.cell.runtime.enabling import SimulatedEnablingDevice
 from touchcell.cell.runtime.sensor import build_sensor
 from touchcell.control.interlocks.always_on import always_on
-from touchcell.control.interlocks.basic import TcpSpeed
-from touchcell.control.interlocks.boundary import WorkspaceConfig
+from touchcell.control.interlocks.basic import DepthConfig, TcpSpeed
+from touchcell.control.interlocks.boundary import TiltConfig, WorkspaceConfig
 from touchcell.control.interlocks.config import build_interlocks
 from touchcell.control.interlocks.interlock import Interlock
+from touchcell.control.interlocks.tactile import ShearConfig
 from touchcell.control.interlocks.timers import TimedInterlock
 from touchcell.control.interlocks.violation import Severity
 from touchcell.control.latch import Latch
@@ -35,7 +36,7 @@ from touchcell.drivers.core.jog import JogInput
 from touchcell.drivers.core.protocols import ExternalTorqueSource, StopCategory, TwistSink, WrenchSource
 from touchcell.errors import ConfigError
 from touchcell.geometry.types import Array
-from touchcell.tasks.interface import Box, Task, TaskContext
+from touchcell.tasks.interface import Box, Cone, Task, TaskContext
 
 AnyInterlock: TypeAlias = Interlock | TimedInterlock
 
@@ -96,6 +97,9 @@ def compose(
         T_world_base={role: plan.cell.arms[name].T_world_base for name, role in role_of.items()},
         carriers={role: sensor.arm_role for role, sensor in sensors.items() if sensor.arm_role is not None},
         boxes=_boxes(plan, sensor_poses),
+        cones=_cones(plan, sensor_poses),
+        max_depth_m=_smallest_mm(plan, DepthConfig) * 1e-3,
+        max_shear_m=_smallest_mm(plan, ShearConfig) * 1e-3,
     )
 
     def resumed_task() -> Task:
@@ -127,6 +131,24 @@ def compose(
         watchdog=world.watchdog,
         require_armed=partial(require_armed, plan, configured, planning_scene),
     )
+
+
+def _cones(plan: CellPlan, T_tcp_sensor: Mapping[str, Array]) -> Mapping[str, tuple[Cone, ...]]:
+    """The limits on the tilt of each arm role."""
+    found: dict[str, tuple[Cone, ...]] = {}
+    for entry in plan.cell.interlocks.values():
+        if isinstance(entry, TiltConfig):
+            axis = np.eye(3)[2] if entry.sensor is None else T_tcp_sensor[entry.sensor][:3, 2]
+            direction = np.array(entry.direction) / np.linalg.norm(entry.direction)
+            cone = Cone(axis, direction, math.radians(entry.limit_deg))
+            found[entry.arm] = (*found.get(entry.arm, ()), cone)
+    return found
+
+
+def _smallest_mm(plan: CellPlan, kind: type[DepthConfig] | type[ShearConfig]) -> float:
+    """The smallest limit of a kind of interlock, mm; infinite where there is none."""
+    limits = (entry.limit_mm for entry in plan.cell.interlocks.values() if isinstance(entry, kind))
+    return min(limits, default=math.inf)
 
 
 def _boxes(plan: CellPlan, T_tcp_sensor: Mapping[str, Array]) -> Mapping[str, tuple[Box, ...]]:

@@ -1,0 +1,72 @@
+"""Where a sensor first touched, from the change of its image over the arm's advance."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from touchcell.control.touch_zero import TouchZero
+from touchcell.geometry.types import Array
+
+FRAME_NS = 33_000_000
+STEP_NS = 11_000_000
+
+
+def contact(depth_m: float) -> Array:
+    T = np.eye(4)
+    T[2, 3] = -depth_m
+    return T
+
+
+def approach(zero: TouchZero, at_m: float, read: float, misread_m: float, late_ns: int, gives_way_m: float) -> None:
+    """Advance at 10 mm/s, rest 1.5 mm deep for half a second, and press on at 8 mm/s; the object yields in the end."""
+    advance_m, t_ns, deepest_m = 0.0, 0, at_m + 1.5e-3
+    rested_s, past = 0.0, []
+    for seq in range(90):
+        for _ in range(FRAME_NS // STEP_NS):
+            t_ns += STEP_NS
+            if advance_m < deepest_m:
+                advance_m += 10e-3 * 1e-9 * STEP_NS
+            elif rested_s < 0.5:
+                rested_s += 1e-9 * STEP_NS
+            else:
+                advance_m += 8e-3 * 1e-9 * STEP_NS
+            T = np.eye(4)
+            T[2, 3] = advance_m
+            past.append((t_ns, advance_m))
+            zero.moved(t_ns, T)
+        exposed_m = next((m for t, m in reversed(past) if t <= t_ns - late_ns), 0.0)
+        depth_m = min(max(exposed_m - at_m, 0.0), gives_way_m)
+        touched = contact(read * depth_m + misread_m) if depth_m > 0.3e-3 else None
+        # Stamped as if it had come without delay.
+        zero.saw(t_ns, seq, 0.004 if depth_m == 0.0 else 90.0 * depth_m, touched)
+
+
+@given(st.floats(3e-3, 8e-3), st.floats(0.92, 1.05), st.floats(-0.5e-3, 0.5e-3), st.sampled_from([0, 9, 18, 27]))
+def test_what_a_model_misreads_is_found_whatever_the_delay_of_frames(
+    at_m: float, read: float, misread_m: float, late_ms: int
+) -> None:
+    zero = TouchZero()
+    approach(zero, at_m, read, misread_m, late_ms * 1_000_000, 3.5e-3)
+    assert zero.ended
+    assert zero.error_m is not None
+    # It is that of the depth at which the object gave way.
+    assert zero.error_m == pytest.approx((read - 1.0) * 3.5e-3 + misread_m, abs=0.3e-3)
+
+
+def test_nothing_is_told_before_the_sensor_rests_in_contact() -> None:
+    zero = TouchZero()
+    for seq in range(20):
+        T = np.eye(4)
+        T[2, 3] = 0.3e-3 * seq
+        zero.moved(seq * FRAME_NS, T)
+        zero.saw(seq * FRAME_NS, seq, 0.01 * seq, contact(0.1e-3 * seq))
+    assert zero.error_m is None
+
+
+def test_an_error_beyond_what_models_err_is_left_out() -> None:
+    zero = TouchZero()
+    approach(zero, 5e-3, 1.0, 2e-3, 0, 3.5e-3)
+    assert zero.error_m is None
