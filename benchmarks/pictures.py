@@ -30,6 +30,7 @@ _DEADLINE_S: Final = 180.0
 _PHONE: Final = {"width": 390, "height": 844}
 _DESK: Final = {"width": 1280, "height": 900}
 _TALL: Final = {"width": 1280, "height": 1500}
+_SLIDES_IN_S: Final = 3.0
 _RERUN_SETTLES_S: Final = 60.0
 """Software draws Rerun's viewer here, and decodes the images meanwhile."""
 
@@ -61,7 +62,9 @@ def _ui_run(browser: Any, folder: Path, picture: Path) -> None:
     with _served(folder, "ui", "--port", "0") as address:
         page = _page(browser, address.replace("/?", "/run/dual_push?"), _TALL)
         slider = page.locator(".q-slider").first
-        _until(lambda: slider.bounding_box() is not None)
+        # Read to its end: the slider is there, and at the end.
+        page.wait_for_function("/\\d s · done/.test(document.querySelector('.q-badge')?.innerText)")
+        time.sleep(_SLIDES_IN_S)
         slider.click(position={"x": 0.62 * slider.bounding_box()["width"], "y": 10})
         page.wait_for_function("document.querySelector('.q-badge').innerText.startsWith('run')")
         page.locator("svg .present").first.wait_for(state="attached")
