@@ -82,7 +82,7 @@ def test_a_limit_below_what_a_healthy_device_needs_is_named(said: Said, changes:
 
 @pytest.mark.parametrize(("tilt_deg", "refused"), [(180, False), (140, False), (130, True), (90, True)])
 def test_a_start_outside_its_cone_is_named(said: Said, tilt_deg: float, refused: bool) -> None:
-    found = said(changed(FOLLOW, arms__arm__start_pose_mm_deg=[-80, 0, 60, tilt_deg, 0, 0]))
+    found = said(sway(changed(FOLLOW, arms__arm__start_pose_mm_deg=[-80, 0, 60, tilt_deg, 0, 0])))
     assert set(found) == ({"arms.arm.start_pose_mm_deg"} if refused else set())
     assert all("interlocks.tilt would trip at once" in message for message in found.values())
 
@@ -105,7 +105,10 @@ def test_a_start_too_near_an_obstacle_is_named(said: Said, height_mm: float, ref
 def test_a_start_in_contact_is_named_where_the_task_starts_free(said: Said, z_mm: float, refused: bool) -> None:
     found = said(changed(FOLLOW, arms__arm__start_pose_mm_deg=[-80, 0, z_mm, 180, 0, 0]))
     assert set(found) == ({"arms.arm.start_pose_mm_deg"} if refused else set())
-    base = {"arms__arm__base_pose_mm_deg": [0, 0, 30, 0, 0, 0]}
+    base = {
+        "arms__arm__base_pose_mm_deg": [0, 0, 30, 0, 0, 0],
+        "interlocks__workspace__min_mm": [-150, -50, -60],
+    }
     assert not said(changed(FOLLOW, arms__arm__start_pose_mm_deg=[-80, 0, max(z_mm, 11), 180, 0, 0], **base))
 
 

@@ -345,7 +345,7 @@ def test_reset_without_a_run_that_waits(
 def test_reset_and_resume_from_another_shell(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     cell = waiting_cell()
     # It trips by itself: gliding shears the contact, and the shear stays when the arm has stopped.
-    cell["interlocks"]["shear"] = {"kind": "shear", "limit_mm": 0.25, "hold_ms": 20}
+    cell["interlocks"]["shear"] = {"kind": "shear", "limit_mm": 2.0, "hold_ms": 20}
     path, folder = tmp_path / "cell.yaml", tmp_path / "run"
     path.write_text(yaml.safe_dump(cell))
     command = [sys.executable, "-m", "touchcell", "run", str(path), "--out", str(folder), "--quiet"]
