@@ -72,6 +72,12 @@ EQUIVALENT: Mapping[tuple[str, str, str], str] = {
     ("always_on", "if self.arms <= view.arms.keys() and self.sensors <= view.sensors.keys():", "LtE -> Lt"): SHORTCUT,
     ("always_on", "return replace(view, now_ns=view.now_ns + round(1e9 * SILENCE_S))", "Mult -> Div"): "it is 1 s",
     ("supervisor", "if not names and not self._limiting:", "if -> if False"): SHORTCUT,
+    (
+        "supervisor",
+        "self._levelled = rule if isinstance(rule, Levelled) else None",
+        "x if c else y -> c = True",
+    ): "a rule without levels raises when it is asked for them, which is suppressed",
+    ("supervisor", "if self._levelled is not None:", "if -> if True"): "None raises, which is suppressed",
     ("supervisor", "if total_ns or name in names:", "if -> if True"): "an entry that counts nothing is as none",
     ("collision", "safe = np.where(np.abs(d) > _TINY, d, 1.0)", "Gt -> GtE"): EXACT,
     ("collision", "rising = np.where(slope[:, -1] < 0.0, 7, rising)", "Lt -> LtE"): EXACT,
