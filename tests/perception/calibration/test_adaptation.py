@@ -256,7 +256,7 @@ def test_image_with_the_label_of_another_is_named(
     model: Model, other_sensor: tuple[LabelledDiscs, LabelledDiscs]
 ) -> None:
     few, _ = other_sensor
-    assert not {"3", "26"} & set(_adapted(model, few).doubtful)
+    assert not {"image 3", "image 26"} & set(_adapted(model, few).doubtful)
     xi = few.xi.copy()
     xi[[3, 26]] = few.xi[[26, 3]]
     found = adapt_to(
