@@ -212,7 +212,7 @@ def _wrong(contacts: np.ndarray, what: str) -> np.ndarray:
 @pytest.mark.parametrize(
     ("what", "says"),
     [
-        ("other images", "depth and tilt and shear cannot be what the images show"),
+        ("other images", "labels' depth and tilt"),
         ("shear of other images", "labels' shear cannot be"),
         ("depth of other images", "labels' depth cannot be"),
         ("radians", "tilt in degrees"),

@@ -60,7 +60,8 @@ _RIDGE = 0.01
 _TAIL_SCALE = 0.6  # Of models that were calibrated on thousands of contacts.
 _SECTORS = 8
 # A real second sensor has correlations of 0.96, 1.00 and 0.67; of ten images at least 0.87, 0.98 and 0.30.
-_LEAST_SIMILAR_DEPTH, _LEAST_SIMILAR_TILT, _LEAST_SIMILAR_SHEAR = 0.6, 0.7, 0.25
+_LEAST_SIMILAR_DEPTH, _LEAST_SIMILAR_TILT, _LEAST_SIMILAR_SHEAR = 0.6, 0.7, (0.25, 0.4)
+_MANY = 24  # Contacts, from which on the second limit of shear holds.
 _LEAST_DEPTH_RATIO, _LEAST_TILT_RATIO = 0.05, 0.05
 _USEFUL = 0.8
 _DOUBTFUL, _FAR = 12.0, 5.0
@@ -290,7 +291,7 @@ def refuse_unlike(outputs: Array, contacts: Array, convention: Convention) -> No
     found = (
         ("depth", depth, _LEAST_SIMILAR_DEPTH),
         ("tilt", convention.tilt_explained, _LEAST_SIMILAR_TILT),
-        ("shear", convention.shear_explained, _LEAST_SIMILAR_SHEAR),
+        ("shear", convention.shear_explained, _LEAST_SIMILAR_SHEAR[len(contacts) >= _MANY]),
     )
     unlike = [name for name, similar, least in found if similar < least]
     if unlike:
