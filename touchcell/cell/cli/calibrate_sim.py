@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
@@ -94,7 +95,7 @@ def calibrate_sim(
         sets = {"fitted to": contacts, "train, held out": held_out}
         if split_folder(data, "val").is_dir():
             validation = read_split(data, "val")
-            some = np.array(evenly(len(validation.images), _HELD_OUT))
+            some = np.array(evenly(len(validation.images), _HELD_OUT), np.intp)
             sets["val, held out"] = markers.contacts(validation, some, show)[0]
     found = {name: marker_errors(sensor, each, markers.reference) for name, each in sets.items()}
     measured: dict[str, str | int | float | dict[str, float]] = {
@@ -150,7 +151,12 @@ def _print(console: Console, found: Mapping[str, MarkerErrors]) -> None:
 
 
 def _write_picture(
-    path: Path, markers: SensorMarkers, split: Split, sensor: Sensor, contacts: MarkedContacts, numbers: Array
+    path: Path,
+    markers: SensorMarkers,
+    split: Split,
+    sensor: Sensor,
+    contacts: MarkedContacts,
+    numbers: NDArray[np.intp],
 ) -> None:
     from touchcell.simulation.tip_figures import write_comparison
 

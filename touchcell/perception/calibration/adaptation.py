@@ -60,7 +60,8 @@ _RIDGE = 0.01
 _TAIL_SCALE = 0.6  # Of models that were calibrated on thousands of contacts.
 _SECTORS = 8
 # A real second sensor has correlations of 0.96, 1.00 and 0.67; of ten images at least 0.87, 0.98 and 0.30.
-_LEAST_SIMILAR_DEPTH, _LEAST_SIMILAR_TILT, _LEAST_SIMILAR_SHEAR = 0.6, 0.7, 0.25
+_LEAST_SIMILAR_DEPTH, _LEAST_SIMILAR_TILT, _LEAST_SIMILAR_SHEAR = 0.6, 0.7, (0.25, 0.4)
+_MANY = 24  # Contacts, from which on the second limit of shear holds.
 _LEAST_DEPTH_RATIO, _LEAST_TILT_RATIO = 0.05, 0.05
 _USEFUL = 0.8
 _DOUBTFUL, _FAR = 12.0, 5.0
@@ -185,8 +186,8 @@ def adapt_to(
         raise TrainingError(f"{int(matched.sum())} images could be matched, {_FEWEST} are needed", hint="give more")
     contacts = contact_from_xi(dataset.xi[matched])
     candidates = _Candidates(old, displacements[matched], contacts, settings)
-    used = np.flatnonzero(matched)
-    refuse_outliers(contacts, [names[i] if names else f"image {i}" for i in used])
+    used = [names[i] if names else f"image {i}" for i in range(len(matched)) if matched[i]]
+    refuse_outliers(contacts, used)
     convention = find_convention(candidates.outputs, contacts)
     refuse_unlike(candidates.outputs, contacts, convention)
     method, left_out = candidates.judged()
@@ -233,7 +234,6 @@ def adapt_to(
         tensors,
     )
     mean = left_out["mean"]
-    numbers = used[candidates.doubtful(method)]
     return Adapted(
         model=model,
         method=method,
@@ -245,7 +245,7 @@ def adapt_to(
         no_better=tuple(
             name for name, error, limit in zip(CONTACT_NAMES, left_out[method], mean, strict=True) if error >= limit
         ),
-        doubtful=tuple(names[i] if names else str(i) for i in numbers),
+        doubtful=tuple(used[i] for i in candidates.doubtful(method)),
     )
 
 
@@ -253,7 +253,7 @@ def refuse_outliers(contacts: Array, names: Sequence[str]) -> None:
     """Raise TrainingError where a label of contacts (n, 6) is far from all others, with the image's name."""
     low, middle, high = np.quantile(contacts, [0.1, 0.5, 0.9], axis=0)
     off = np.abs(contacts - middle) / np.maximum(high - low, 1e-6)
-    i, component = np.unravel_index(int(np.argmax(off)), off.shape)
+    i, component = divmod(int(np.argmax(off)), off.shape[1])
     if off[i, component] > _FAR:
         raise TrainingError(
             f"{names[i]}: {CONTACT_NAMES[component]} of {contacts[i, component]:g} is far from all others",
@@ -291,7 +291,7 @@ def refuse_unlike(outputs: Array, contacts: Array, convention: Convention) -> No
     found = (
         ("depth", depth, _LEAST_SIMILAR_DEPTH),
         ("tilt", convention.tilt_explained, _LEAST_SIMILAR_TILT),
-        ("shear", convention.shear_explained, _LEAST_SIMILAR_SHEAR),
+        ("shear", convention.shear_explained, _LEAST_SIMILAR_SHEAR[len(contacts) >= _MANY]),
     )
     unlike = [name for name, similar, least in found if similar < least]
     if unlike:

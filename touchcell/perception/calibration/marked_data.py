@@ -56,8 +56,8 @@ class SensorMarkers:
         return self.matcher.match(detect_markers(self.preprocessing.reduce(image), self.size))
 
     def contacts(
-        self, split: Split, which: Array, progress: StageCallback | None = None
-    ) -> tuple[MarkedContacts, Array]:
+        self, split: Split, which: NDArray[np.intp], progress: StageCallback | None = None
+    ) -> tuple[MarkedContacts, NDArray[np.intp]]:
         """Match the markers of some images, in the 640x480 frame, and drop uncertain matches.
 
         Args:
@@ -78,7 +78,7 @@ class SensorMarkers:
             if progress is not None:
                 progress("matched", i + 1, len(which))
         labels = se3.from_euler_mm_deg(split.contact_mm_deg[kept])
-        return MarkedContacts(labels, np.array(pixels), np.array(seen, bool)), np.array(kept)
+        return MarkedContacts(labels, np.array(pixels), np.array(seen, bool)), np.array(kept, np.intp)
 
 
 def frame_origin(size: tuple[int, int], crop: tuple[int, int, int, int] | None = None) -> Array:

@@ -172,9 +172,9 @@ def ring_modes(displacements: NDArray[Any], weights: NDArray[np.complex128]) -> 
         weights: of ``ring_weights``.
     """
     moved = displacements.reshape(len(displacements), -1, 2) @ np.array([1.0, 1.0j])
-    modes = np.einsum("nm,bkm->nbk", moved, weights)
+    modes: NDArray[np.complex128] = np.einsum("nm,bkm->nbk", moved, weights)
     modes[:, :, 2] = modes[:, :, 2].conj()
-    return modes.astype(np.complex128)
+    return modes
 
 
 def features(spec: TransferSpec, outputs: Array, scores: Array, rings: NDArray[np.complex128]) -> Features:
