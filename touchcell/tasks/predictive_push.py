@@ -521,7 +521,7 @@ class PredictivePush:
         if self._has_waypoints and left_m > settings.look_ahead_m:
             target, goal = self._path.point(along_m + settings.look_ahead_m), None
         # A follower's force changes on the way: what turns the object then is kept.
-        kept = self._plan.curvature if settings.followed else 0.0
+        kept = self._plan.curvature if settings.followed or goal is not None else 0.0
         return steer(center, model, target, goal, settings.friction, kept)
 
     def _accelerate(self, dt_s: float, remaining_m: float) -> None:
