@@ -83,8 +83,9 @@ def test_an_object_that_is_steered_arrives(
     model: PushModel, aside_m: float, heading_rad: float, goal_rad: float | None
 ) -> None:
     model = PushModel(model.reach_m, 0.3 * model.offset_m, model.lever_m2)
-    thing, target = PushedObject(model, heading_rad), (0.3, aside_m)
-    while (plan := steer(thing.center, model, target, goal_rad, 10.0)).remaining_m > 0.0:
+    thing, target, kept = PushedObject(model, heading_rad), (0.3, aside_m), 0.0
+    while (plan := steer(thing.center, model, target, goal_rad, 10.0, kept)).remaining_m > 0.0:
+        kept = plan.curvature
         motion = model.motion(0.1, plan.curvature)
         thing.push(motion.contact_ahead_m_s, motion.contact_left_m_s, 0.01)
     assert math.hypot(thing.center.x - target[0], thing.center.y - target[1]) < 2e-3

@@ -112,15 +112,6 @@ def test_a_width_that_was_told_wrong_is_found_out(tmp_path):
     assert pushed.object_mm_deg[:2] == pytest.approx((120.0, 5.0), abs=0.6)
 
 
-def test_a_round_side_that_was_told_flat_is_not_pushed(tmp_path):
-    data = cell_file(CELL, **SHORT, task__side_width_mm=None)
-    data["scene"]["objects"]["prism"]["shape"] = ROUND
-    pushed = push(data, tmp_path)
-    assert pushed.path == [*START, *MISSED]
-    assert "it is not flat" in why_missed(pushed)
-    assert pushed.object_mm_deg[0] < 3.0
-
-
 def test_a_target_that_asks_for_more_tilt_than_is_allowed_is_given_up(tmp_path):
     pushed = push(cell_file(CELL, scene__step_ms=10, task__target_mm=[60, 200]), tmp_path)
     assert pushed.path[-2:] == MISSED

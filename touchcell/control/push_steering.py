@@ -71,7 +71,9 @@ class Plan:
         return abs(self.wanted - self.curvature) > 1e-9
 
 
-def steer(center: Pose, model: PushModel, target: Point, goal_heading: float | None, friction: float) -> Plan:
+def steer(
+    center: Pose, model: PushModel, target: Point, goal_heading: float | None, friction: float, kept: float = 0.0
+) -> Plan:
     """Return the plan that takes an object's centre to the target.
 
     Args:
@@ -80,6 +82,8 @@ def steer(center: Pose, model: PushModel, target: Point, goal_heading: float | N
         target: where the object's middle is to arrive.
         goal_heading: of the contact normal there, rad; None where it is free.
         friction: slope of the friction cone that may be used.
+        kept: curvature where the target is too near to steer.
+        kept: curvature where the target is too near to steer.
     """
     lowest, highest = model.curvatures(friction)
     # The centre, moving as the unicycle does: parallel to it while the path is straight, and swinging behind it.
@@ -90,7 +94,7 @@ def steer(center: Pose, model: PushModel, target: Point, goal_heading: float | N
     ahead, left = moving.local((beside.x, beside.y))
     length, swing = math.hypot(ahead, left), model.lead_m * math.cos(model.drift_rad)
     if ahead < _SHORTEST_M:
-        wanted = 0.0
+        wanted = kept
     elif goal_heading is None:
         wanted = 3.0 * left * (length - swing) / ((length - swing) ** 3 + swing**3 + _CALM_M**3)
     else:

@@ -68,10 +68,6 @@ _LEAST_APART_M: Final = 0.006
 """... and nearer ones do not tell how it is turned."""
 _FLAT_RAD: Final = math.radians(3.0)
 """Turn of the normal between them from which a side is not flat."""
-_BULGE_M: Final = 0.5e-3
-"""Height of a side over the line between its edges from which it is not flat ..."""
-_BULGE: Final = 0.06
-"""... where it is this share of half that line, too: tan(theta / 2) of a round side whose normals turn by theta."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,8 +185,6 @@ class PredictivePush:
         self._loaded_m = 0.0
         self.depth_error_m = 0.0
         """What a model reads too much of the contact's depth."""
-        self.misfit = ""
-        """Why the object is not what is described; empty where it is, as far as touch tells."""
         self.motion = _STANDING
         self.located: Pose | None = None
         """The object's middle while it rests and will be touched anew, with its heading."""
@@ -337,12 +331,6 @@ class PredictivePush:
                 found, sigma_m = one.middle, _EDGE_SIGMA_M if is_told else sigma_m
                 break
             found, felt_m = one.between(other)
-            bulge_m = -_pose_of(found).local((side.x_m, side.y_m))[0]
-            # A first contact with an edge, whose normal is not the side's, tells nothing of it.
-            of_side = abs(math.remainder(side.heading_rad - found.heading_rad, 2.0 * math.pi)) < _SIDE_SIGMA_RAD
-            if of_side and bulge_m > max(_BULGE_M, 0.5 * _BULGE * felt_m):
-                self.misfit = f"the touched side bulges by {1e3 * bulge_m:.1f} mm: it is not flat (`sides: round`?)"
-                return found, sigma_m
             sigma_m = max(_EDGES_SIGMA_M, 0.5 * abs(felt_m - width_m))
             if not is_told or sigma_m < 0.5 * _WIDTH_M:
                 found = yield from self._straightened(T_base_sensor, found, 0.5 * felt_m)
@@ -372,10 +360,6 @@ class PredictivePush:
             return middle
         turned = math.remainder(left.heading_rad - right.heading_rad, 2.0 * math.pi)
         if abs(turned) > _FLAT_RAD:
-            self.misfit = (
-                f"the touched side is turned by {math.degrees(abs(turned)):.0f} deg from one end to the other: "
-            )
-            self.misfit += "it is not flat (`sides: round`?)"
             return middle
         heading = math.atan2(left.y_m - right.y_m, left.x_m - right.x_m) - 0.5 * math.pi
         misread = math.remainder(right.heading_rad + 0.5 * turned - heading, 2.0 * math.pi)
@@ -536,7 +520,9 @@ class PredictivePush:
         left_m = self._path.length_m - along_m
         if self._has_waypoints and left_m > settings.look_ahead_m:
             target, goal = self._path.point(along_m + settings.look_ahead_m), None
-        return steer(center, model, target, goal, settings.friction)
+        # A follower's force changes on the way: what turns the object then is kept.
+        kept = self._plan.curvature if settings.followed or goal is not None else 0.0
+        return steer(center, model, target, goal, settings.friction, kept)
 
     def _accelerate(self, dt_s: float, remaining_m: float) -> None:
         settings = self._settings

@@ -57,8 +57,7 @@ class PushConfig(ContactServoConfig):
             each cycle (``touchcell.control.push_steering``); ``bearing`` is the paper's controller on the bearing of
             the path, which the keys ``align_*`` set.
         tip_radius_mm: radius of the tip.
-        sides: whether the pushed side is flat, or round so that its normal points at the object's centre; a round one
-            that is told flat fails.
+        sides: whether the pushed side is flat, or round so that its normal points at the object's centre.
         friction_radius_mm: mean distance of the object's bottom from its centre, a first value for the estimate; three
             quarters of the distance from contact to centre without it.
         contact_friction: slope of the friction cone between skin and object that steering may use.
@@ -262,8 +261,6 @@ class Push:
     def update(self, dt_s: float, before: Array, now: Array, T_s_f: Array | None) -> bool:
         """Update the steering; return True at the end of the path, or where the object is too far from it."""
         self._at_limit = self._bounds.reached(dt_s, before, now, T_s_f)
-        if self._predictive is not None:
-            self._at_limit = self._predictive.misfit or self._at_limit
         if T_s_f is None:
             self._alignment.pause()
             if self._predictive is not None:
