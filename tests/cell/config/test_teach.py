@@ -61,6 +61,7 @@ def test_other_styles_are_kept_too(text: str) -> None:
 
 def test_a_start_pose_changes_one_line(tmp_path: Path) -> None:
     path = copied(tmp_path, "surface_follow_sim.yaml")
+    path.write_text(path.read_text().replace("distance_mm: 180", "distance_mm: 30"))
     before = path.read_text()
     teacher(path).save("arm", "start", POSE)
     assert changes(before, path.read_text()) == [
@@ -113,7 +114,7 @@ def test_a_surface_is_where_the_sensor_is(tmp_path: Path) -> None:
 
 def test_a_file_that_builds_on_another_gets_the_value_itself(tmp_path: Path) -> None:
     path = tmp_path / "mine.yaml"
-    path.write_text("extends: surface_follow_sim.yaml\nname: mine  # my own\n")
+    path.write_text("extends: surface_follow_sim.yaml\nname: mine  # my own\ntask: {distance_mm: 30}\n")
     teacher(path).save("arm", "start", POSE)
     assert "mine  # my own" in path.read_text()
     assert plan_cell(path).cell.arms["arm"].start_pose_mm_deg == (10.0, -20.0, 30.25, 180.0, 0.0, 45.0)

@@ -73,7 +73,7 @@ def jog_cell(
         has_terminal = read is not None
     own, notes = jog_settings(path, world, settings, speed_mm_s=speed_mm_s, turn_deg_s=turn_deg_s)
     with cell_in_world(path, world, settings=own) as plan:
-        for note in (*notes, *(f"on {world}: {note}" for note in plan.notes)):
+        for note in (*notes, *(note if world is None else f"on {world}: {note}" for note in plan.notes)):
             say(note)
         if has_terminal:
             say("\n".join(HELP))

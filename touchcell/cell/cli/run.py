@@ -113,7 +113,7 @@ def run_cell(
     overrides = {} if data is None else {"data": data}
     with cell_in_world(path, world, overrides, model=model, settings=settings) as plan:
         for note in plan.notes:
-            say(f"on {world}: {note}")
+            say(note if world is None else f"on {world}: {note}")
         run = run_plan(plan, out=out, live=live, live_port=live_port, page_port=page_port)
     end_of_run(run, moving=moving)
     return run.exit_code

@@ -1,4 +1,4 @@
-"""Motions and contacts of a valid cell file with which every run would trip or fail."""
+"""Motions and contacts of a valid cell file with which every run would trip, or end as failed."""
 
 from __future__ import annotations
 
@@ -45,7 +45,16 @@ _WAY_SLACK_MM: Final = 5.0
 
 def unfeasible_motions(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
     """Return one problem for every parameter of a task that no run could follow; the cell has no other problem."""
-    for problems in (_impossible, _times, _ages, _gates, _too_light, _gains, _pressing, _places, _untouched, _unmet):
+    for problems in (_ages, _gates, _too_light, _gains, _pressing, _places, _untouched):
+        yield from problems(file, plan)
+
+
+def failing_motions(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
+    """Return one problem for every parameter with which each run ends as failed, in an orderly way.
+
+    Such a cell may be meant, as in a test of that very end, and is not refused.
+    """
+    for problems in (_impossible, _times, _unmet):
         yield from problems(file, plan)
 
 

@@ -31,6 +31,7 @@ from touchcell.cell.config.cell_plan import (
     SensorSection,
 )
 from touchcell.cell.config.feasibility import unfeasible
+from touchcell.cell.config.feasible_motion import failing_motions
 from touchcell.cell.config.input_files import with_input_files, with_paths
 from touchcell.cell.config.layers import load_layers
 from touchcell.cell.config.stopping_distance import StoppingDistance, combined, overshoot
@@ -216,7 +217,7 @@ class _Planner:
             return planned
         if problems := unfeasible(file, planned):
             raise InvalidCell(problems)
-        notes = (*_remarks(planned), *(f"{name}: left out, as {reason}" for name, reason in left_out.items()))
+        notes = (*_remarks(file, planned), *(f"{name}: left out, as {reason}" for name, reason in left_out.items()))
         return replace(self._require_armed(planned) if self._prove else planned, notes=notes)
 
     def _in_truth(self, cell: CellFile) -> CellFile:
@@ -649,10 +650,11 @@ class _Planner:
         self._problems.append(self._file.problem(path, reason, value=value, hint=hint))
 
 
-def _remarks(plan: CellPlan) -> tuple[str, ...]:
+def _remarks(file: YamlFile, plan: CellPlan) -> tuple[str, ...]:
     from touchcell.cell.config.armed import advised
 
-    return (*advised(plan), *_remarks_on_scene(plan))
+    failing = (f"each run would fail: {problem}" for problem in failing_motions(file, plan))
+    return (*advised(plan), *_remarks_on_scene(plan), *failing)
 
 
 def _remarks_on_scene(plan: CellPlan) -> tuple[str, ...]:
