@@ -80,7 +80,7 @@ class MeshConfig(MeshSurfaceConfig):
         file: the mesh, beside the cell file.
         unit: of its coordinates, which no mesh file declares.
         scale: factor on the mesh, as for one that was normalised to a size of 1.
-        repair: close small holes, orient all faces, and use what stays open as a sheet.
+        repair: weld corners, close small holes, orient all faces, and make a thin wall of what stays open.
     """
 
     kind: Literal["mesh"]

@@ -27,8 +27,9 @@ LARGEST_HOLE: Final = 12
 MOST_OPEN: Final = 0.1
 """Share of its own area that a piece of a mesh may lack to be closed; with larger openings it is a sheet."""
 SHEET_M: Final = 0.2e-3
-"""Thickness of a sheet with two sides."""
-_MOSTLY: Final = 0.9
+"""Thickness that a repair gives to a sheet."""
+WELD_M: Final = 10e-6
+"""Distance of corners that a repair makes one: no finger feels it, and exporters round by less."""
 INSTALL: Final = "pip install 'touchcell[mesh]'"
 
 
@@ -46,9 +47,9 @@ def load_mesh(path: Path, unit: Unit, *, scale: float = 1.0, repair: bool) -> Tr
     """Read a mesh file: STL, OBJ or PLY.
 
     Vertices that coincide are merged and faces without an area dropped, always. A mesh that does not enclose a volume
-    is refused unless ``repair`` asks for small holes to be closed and faces to be oriented; what stays open is a sheet,
-    whose outside is where the normals of its faces point. Where a file has each face twice, once for either side, as
-    models for drawing do, its sheets become walls of 0.2 mm that can be touched from both sides.
+    is refused unless ``repair`` asks for corners within 0.01 mm to be welded, small holes to be closed and faces to be
+    oriented; what lacks more than a tenth of its area then is a sheet and becomes a wall of 0.2 mm, which can be
+    touched from both sides.
 
     Args:
         path: the file.
@@ -86,18 +87,16 @@ def load_mesh(path: Path, unit: Unit, *, scale: float = 1.0, repair: bool) -> Tr
     _require_likely_size(path, scale * np.asarray(loaded.vertices), unit)
     loaded.apply_scale(scale)
     loaded.merge_vertices(merge_tex=True, merge_norm=True)
-    read = _triangles(loaded, unit)
-    mesh = _without_empty_faces(read)
+    mesh = _without_empty_faces(_triangles(loaded, unit))
     if repair:
-        repaired = _repaired(mesh)
-        return with_thickness(repaired, SHEET_M) if _two_sided(read) else repaired
+        return with_thickness(_repaired(mesh), SHEET_M)
     if problem := what_is_open(mesh):
         raise ConfigError(
             f"does not enclose a volume: {problem}",
             key="file",
             value=str(path),
-            hint="`repair: true` closes small holes and orients the faces; what stays open is used as a sheet whose "
-            "outside is where its faces' normals point",
+            hint="`repair: true` welds corners, closes small holes and orients the faces; what stays open becomes a "
+            "wall of 0.2 mm, which can be touched from both sides",
         )
     if volume_m3(mesh) < 0.0:
         hint = "`repair: true` turns its faces round"
@@ -157,12 +156,17 @@ def _require_likely_size(path: Path, vertices: Any, unit: Unit) -> None:
     if SMALLEST_M <= size_m <= LARGEST_M:
         return
     likely = [each for each, metres in UNITS.items() if 10e-3 <= extent * metres <= 1.0]
+    of_one = abs(extent - 1.0) < 0.02 or abs(extent - 2.0) < 0.04
     others = " or ".join(f"`unit: {each}` ({extent * UNITS[each] * 1e3:.4g} mm)" for each in likely)
     raise ConfigError(
         f"{path.name} would be {size_m * 1e3:.4g} mm large, which no tip follows",
         key="unit",
         value=unit,
-        hint=f"its size suggests {others}" if others else "export it in millimetres, or give its `scale`",
+        hint=(
+            f"its size suggests {others}" + (", or that it was made of size 1: then give its `scale`" if of_one else "")
+            if others
+            else "export it in millimetres, or give its `scale`"
+        ),
     )
 
 
@@ -183,10 +187,27 @@ def _without_empty_faces(mesh: TriangleMesh) -> TriangleMesh:
 def _repaired(mesh: TriangleMesh) -> TriangleMesh:
     import trimesh
 
+    mesh = _without_empty_faces(_welded(mesh, WELD_M))
     made = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     trimesh.repair.fix_winding(made)
     oriented = _as_most_were(mesh, _triangles(made, "m"))
     return _with_outside_out(_with_holes_closed(_without_empty_faces(oriented)))
+
+
+def _welded(mesh: TriangleMesh, distance_m: float) -> TriangleMesh:
+    """Make vertices one that lie within ``distance_m`` of each other, at the place of one of them."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import cKDTree
+
+    pairs = cKDTree(mesh.vertices).query_pairs(distance_m, output_type="ndarray")
+    if not len(pairs):
+        return mesh
+    count = len(mesh.vertices)
+    links = coo_array((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
+    _, label = connected_components(links, directed=False)
+    _, first = np.unique(label, return_index=True)
+    return TriangleMesh(mesh.vertices[first], np.ascontiguousarray(label[mesh.faces], dtype=np.int32))
 
 
 def _as_most_were(before: TriangleMesh, after: TriangleMesh) -> TriangleMesh:
@@ -199,26 +220,20 @@ def _as_most_were(before: TriangleMesh, after: TriangleMesh) -> TriangleMesh:
     return TriangleMesh(after.vertices, np.ascontiguousarray(faces))
 
 
-def _two_sided(mesh: TriangleMesh) -> bool:
-    """Return True if nearly every face is there twice, once the other way round."""
-    a, b, c = mesh.faces.astype(np.int64).T
-    count = len(mesh.vertices)
-    low = np.minimum(np.minimum(a, b), c)
-    # Beginning at its lowest corner, a face and its other side differ in the order of the other two.
-    second = np.where(low == a, b, np.where(low == b, c, a))
-    third = a + b + c - low - second
-    one, other = (low * count + second) * count + third, (low * count + third) * count + second
-    return bool(np.isin(one, other).mean() >= _MOSTLY)
-
-
 def with_thickness(mesh: TriangleMesh, thickness_m: float) -> TriangleMesh:
-    """Return a mesh whose open pieces are walls: two sides, half of ``thickness_m`` away from the sheet, and a rim."""
+    """Return a mesh whose sheets are walls: two sides, half of ``thickness_m`` away from the sheet, and a rim.
+
+    Pieces that are closed but for MOST_OPEN of their area have an inside, and stay as they are.
+    """
     edges = Edges.of(mesh.faces)
+    if not edges.open_count:
+        return mesh
     piece, open_edge = _pieces(edges), edges.other < 0
-    sheets = np.isin(piece, np.unique(piece[open_edge.any(axis=1)]))
+    sheets = ~_nearly_closed(mesh, piece, open_edge)[piece]
+    if not sheets.any():
+        return mesh
     sheet, count = mesh.faces[sheets], len(mesh.vertices)
-    normals = np.zeros_like(mesh.vertices)
-    doubled = mesh.face_normals()[sheets]
+    doubled, normals = mesh.face_normals()[sheets], np.zeros_like(mesh.vertices)
     for i in range(3):
         np.add.at(normals, sheet[:, i], doubled)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
@@ -232,15 +247,42 @@ def with_thickness(mesh: TriangleMesh, thickness_m: float) -> TriangleMesh:
     )
 
 
+def _nearly_closed(mesh: TriangleMesh, piece: NDArray[np.int64], open_edge: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return (m,) for each number of a piece whether lids on its openings would be at most MOST_OPEN of its own area.
+
+    Args:
+        mesh: all pieces.
+        piece: (m,) the piece of each face.
+        open_edge: (m, 3) edges of one face only.
+    """
+    face, edge = np.nonzero(open_edge)
+    start, end = mesh.faces[face, edge], mesh.faces[face, (edge + 1) % 3]
+    # The edges of each opening end in each other: their lowest corner numbers the opening.
+    opening = np.arange(len(mesh.vertices))
+    while True:
+        least = opening.copy()
+        np.minimum.at(least, start, opening[end])
+        np.minimum.at(least, end, opening[start])
+        least = least[least]
+        if np.array_equal(least, opening):
+            break
+        opening = least
+    lids, owner = np.zeros_like(mesh.vertices), np.zeros(len(mesh.vertices), np.int64)
+    middle = mesh.vertices.mean(axis=0)
+    np.add.at(lids, opening[start], np.cross(mesh.vertices[start] - middle, mesh.vertices[end] - middle))
+    owner[opening[start]] = piece[face]
+    count = len(mesh.faces)
+    lacking = np.bincount(owner, np.linalg.norm(lids, axis=1), minlength=count)
+    area = np.bincount(piece, np.linalg.norm(mesh.face_normals(), axis=1), minlength=count)
+    return np.asarray(lacking <= MOST_OPEN * area)
+
+
 def _with_outside_out(mesh: TriangleMesh) -> TriangleMesh:
     """Turn round each piece that is inside out, but for sheets, which have no inside."""
-    piece = _pieces(Edges.of(mesh.faces))
-    faces, normals = mesh.faces.copy(), mesh.face_normals()
-    for number in np.unique(piece):
+    edges = Edges.of(mesh.faces)
+    piece, faces = _pieces(edges), mesh.faces.copy()
+    for number in np.unique(piece[_nearly_closed(mesh, piece, edges.other < 0)[piece]]):
         own = piece == number
-        # The normals of a closed surface, each as long as its face is large, add up to zero.
-        if np.linalg.norm(normals[own].sum(axis=0)) > MOST_OPEN * np.linalg.norm(normals[own], axis=1).sum():
-            continue
         corners = mesh.vertices[mesh.faces[own]]
         a, b, c = (corners[:, i] - corners.mean(axis=(0, 1)) for i in range(3))
         if float(np.einsum("mc,mc->", a, np.cross(b, c))) < 0.0:

@@ -8,6 +8,7 @@ faces around a corner (Rusinkiewicz 2004).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
@@ -21,9 +22,9 @@ _UNEVEN: Final = 16.0
 """Largest over smallest face around a corner from which the largest sets the normal: a flat beside a fine fillet."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class TriangleMesh:
-    """Vertices and faces.
+    """Vertices and faces. Two are equal if they are one: what is computed from one can be kept for it.
 
     Attributes:
         vertices: (n, 3) m.
@@ -101,8 +102,12 @@ class SmoothMesh:
     vertex_normals: Array
 
 
+@lru_cache(maxsize=2)
 def smooth(mesh: TriangleMesh, crease_rad: float) -> SmoothMesh:
-    """Return ``mesh`` with normals and curvature; edges sharper than ``crease_rad`` stay sharp."""
+    """Return ``mesh`` with normals and curvature; edges sharper than ``crease_rad`` stay sharp.
+
+    The last two are kept: a check asks several times, and 300 000 faces take two seconds.
+    """
     faces, vertices = mesh.faces, mesh.vertices
     edges = Edges.of(faces)
     doubled = mesh.face_normals()
