@@ -26,6 +26,7 @@ scene:
       pose_mm_deg: [0, 0, -20, 0, 0, 0]
 arms:
   arm: {{start_pose_mm_deg: [0, 0, 45, 180, 0, 0]}}
+interlocks: {{workspace: {{min_mm: [-100, -50, -30]}}}}
 task: {{distance_mm: 5}}
 """
 
