@@ -11,6 +11,8 @@ from typing import Any
 import pytest
 import yaml
 
+from touchcell.cell.cli.exit_codes import EXIT_BAD_INPUT, EXIT_TRIPPED
+from touchcell.cell.cli.main import main
 from touchcell.cell.config.layers import load_layers
 from touchcell.cell.config.schema import plan_cell
 from touchcell.cell.config.yaml_file import InvalidCell
@@ -46,9 +48,11 @@ def cell(tmp_path: Path) -> Callable[..., Path]:
 
 
 def problem(path: Path) -> ConfigError:
-    with pytest.raises(InvalidCell) as caught:
-        plan_cell(path)
-    (found,) = caught.value.problems
+    """Return the one reason for which the cell is refused, or each run would trip."""
+    try:
+        (found,) = plan_cell(path).foreseen
+    except InvalidCell as error:
+        (found,) = error.problems
     assert found.line > 0
     return found
 
@@ -204,7 +208,17 @@ ACCEPTED = [
 
 @pytest.mark.parametrize(("name", "changes"), ACCEPTED)
 def test_what_a_run_may_well_do_is_accepted(cell: Callable[..., Path], name: str, changes: list[Change]) -> None:
-    plan_cell(cell(name, *changes))
+    assert not plan_cell(cell(name, *changes)).foreseen
+
+
+def test_check_refuses_what_each_run_would_trip_on_and_a_run_says_so_and_trips(
+    cell: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = str(cell(FOLLOW, ("interlocks.workspace.max_mm", [-60, 50, 150])))
+    assert main(["check", path]) == EXIT_BAD_INPUT
+    assert "task.distance_mm: leads out of interlocks.workspace" in capsys.readouterr().err
+    assert main(["run", path, "--quiet", "--out", str(tmp_path / "run")]) == EXIT_TRIPPED
+    assert "each run would trip: " in capsys.readouterr().err
 
 
 def test_without_a_model_nothing_is_checked_by_a_motion_and_nothing_backs_off(cell: Callable[..., Path]) -> None:

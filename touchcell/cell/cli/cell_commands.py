@@ -131,6 +131,7 @@ def _check_cell(options: argparse.Namespace) -> int:
     from touchcell.cell.config.armed import proof_table
     from touchcell.cell.config.layers import explain, load_layers
     from touchcell.cell.config.settings import parse_settings
+    from touchcell.cell.config.yaml_file import InvalidCell
     from touchcell.cell.runtime.worlds import plan_for
 
     file, settings = find_cell(options.cell), parse_settings(options.settings)
@@ -142,6 +143,8 @@ def _check_cell(options: argparse.Namespace) -> int:
         if options.world is not None:
             print(explain(load_layers(file, settings, plan.world_settings)))
         return EXIT_OK
+    if plan.foreseen:
+        raise InvalidCell(plan.foreseen)
     print(f"{options.cell}: {plan.cell.name} is valid{'' if options.world is None else f' on {options.world}'}")
     for note in plan.notes:
         print(f"  {note}")

@@ -114,6 +114,8 @@ def run_cell(
     with cell_in_world(path, world, overrides, model=model, settings=settings) as plan:
         for note in plan.notes:
             say(note if world is None else f"on {world}: {note}")
+        for problem in plan.foreseen:
+            warn(f"each run would trip: {problem}")
         run = run_plan(plan, out=out, live=live, live_port=live_port, page_port=page_port)
     end_of_run(run, moving=moving)
     return run.exit_code

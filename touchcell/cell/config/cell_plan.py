@@ -18,6 +18,7 @@ from touchcell.control.interlocks.config import InterlocksConfig
 from touchcell.control.proof import Proof
 from touchcell.drivers.core.device import DeactivatePolicy
 from touchcell.drivers.core.spec import AnyDriver, DriverConfig
+from touchcell.errors import ConfigError
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 from touchcell.perception.runtime.estimator_spec import EstimatorSection
@@ -318,6 +319,7 @@ class CellPlan:
         auxiliary_roles: role in the task -> name in the cell; a device without a role has its own name as role.
         world_settings: values that its world put in place of the file's own, by dotted key, behind ``settings``.
         notes: what its world does not show, what it puts in place of something else, and what a sensor cannot follow.
+        foreseen: why each run would trip, as far as the file tells: ``check`` refuses it, a run warns.
         truth: what the seed made of ``truth:``, by dotted key; empty without one.
     """
 
@@ -338,6 +340,7 @@ class CellPlan:
     proofs: tuple[Proof, ...] = ()
     world_settings: Mapping[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    foreseen: tuple[ConfigError, ...] = ()
     truth: Mapping[str, Any] = field(default_factory=dict)
 
     def __repr__(self) -> str:

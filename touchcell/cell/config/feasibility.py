@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from touchcell.cell.config.demands import demands
-from touchcell.cell.config.feasible_motion import unfeasible_motions
+from touchcell.cell.config.feasible_motion import places_outside
 from touchcell.cell.config.rule_limits import is_kind, limits_of
 from touchcell.cell.config.starts import pose_of, start_of_arm
 from touchcell.cell.config.yaml_file import YamlFile
@@ -46,7 +46,7 @@ def unfeasible(file: YamlFile, plan: CellPlan) -> list[ConfigError]:
         *(() if starts or scene else _contacts(file, plan)),
     ]
     # A run that is refused anyway is not followed.
-    return problems or list(unfeasible_motions(file, plan))
+    return problems or list(places_outside(file, plan))
 
 
 def _models(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:

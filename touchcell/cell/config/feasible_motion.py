@@ -43,9 +43,9 @@ _WAY_SLACK_MM: Final = 5.0
 """By which a way over a surface may be elsewhere: the sensor turns with the surface a little late."""
 
 
-def unfeasible_motions(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
-    """Return one problem for every parameter of a task that no run could follow; the cell has no other problem."""
-    for problems in (_ages, _gates, _too_light, _gains, _pressing, _places, _untouched):
+def foreseen_trips(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
+    """Return one problem for every parameter of a task with which each run would trip; else nothing is wrong."""
+    for problems in (_ages, _gates, _too_light, _gains, _pressing, _ways_out, _untouched):
         yield from problems(file, plan)
 
 
@@ -58,30 +58,18 @@ def failing_motions(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
         yield from problems(file, plan)
 
 
-def _places(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
-    """Places to which the task surely takes an arm, outside a box that it must not leave."""
+def places_outside(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
+    """Return one problem for every place to which the task surely takes an arm, outside a box that it must not leave.
+
+    A way over a known surface is known better than by the plane of the first contact, and left to ``foreseen_trips``.
+    """
     if not plan.sensor_roles:
         return
     start, mount = start_of_sensor(plan)
-    boxes: dict[str, Any] = {rule: box for rule, box in plan.cell.interlocks.items() if is_kind(box, "workspace")}
-    # A way over a known surface is known better than by the plane of the first contact.
     ways = dict(_ways(plan))
     reported: set[KeyPath] = set()
-    for key, way_m in ways.items():
-        for rule, box in boxes.items():
-            beyond = np.maximum(np.array(box.min_mm) - 1e3 * way_m, 1e3 * way_m - np.array(box.max_mm))
-            left = np.flatnonzero((beyond > _WAY_SLACK_MM).any(axis=1))
-            if left.size and box.sensor in plan.sensor_roles and not reported:
-                reported.add(key)
-                at_mm = 1e3 * way_m[left[0]]
-                yield file.problem(
-                    ("task", *key),
-                    f"leads out of interlocks.{rule} over the surface, which would trip: "
-                    f"{_outside(at_mm, box, _WAY_SLACK_MM)}",
-                    hint="go less far, or make the workspace larger",
-                )
     for place in () if plan.task.places is None else plan.task.places(plan.task_config, start, mount):
-        for rule, box in boxes.items():
+        for rule, box in _boxes(plan).items():
             if place.key in reported or place.key in ways or box.arm != place.arm:
                 continue
             carried = plan.sensor_roles.get(box.sensor or "")
@@ -92,6 +80,29 @@ def _places(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
                 yield file.problem(
                     ("task", *place.key),
                     f"leads out of interlocks.{rule}, which would trip: {outside}",
+                    hint="go less far, or make the workspace larger",
+                )
+
+
+def _boxes(plan: CellPlan) -> dict[str, Any]:
+    return {rule: box for rule, box in plan.cell.interlocks.items() if is_kind(box, "workspace")}
+
+
+def _ways_out(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
+    """Ways over surfaces of the scene, out of a box that the arm must not leave."""
+    boxes = _boxes(plan)
+    reported: set[KeyPath] = set()
+    for key, way_m in _ways(plan) if plan.sensor_roles else ():
+        for rule, box in boxes.items():
+            beyond = np.maximum(np.array(box.min_mm) - 1e3 * way_m, 1e3 * way_m - np.array(box.max_mm))
+            left = np.flatnonzero((beyond > _WAY_SLACK_MM).any(axis=1))
+            if left.size and box.sensor in plan.sensor_roles and not reported:
+                reported.add(key)
+                at_mm = 1e3 * way_m[left[0]]
+                yield file.problem(
+                    ("task", *key),
+                    f"leads out of interlocks.{rule} over the surface, which would trip: "
+                    f"{_outside(at_mm, box, _WAY_SLACK_MM)}",
                     hint="go less far, or make the workspace larger",
                 )
 

@@ -6,7 +6,6 @@ task fit, and says which devices the task does not need, so that they are not ev
 
 from __future__ import annotations
 
-import itertools
 import math
 import os
 from collections.abc import Collection, Mapping
@@ -31,7 +30,7 @@ from touchcell.cell.config.cell_plan import (
     SensorSection,
 )
 from touchcell.cell.config.feasibility import unfeasible
-from touchcell.cell.config.feasible_motion import failing_motions
+from touchcell.cell.config.feasible_motion import failing_motions, foreseen_trips
 from touchcell.cell.config.input_files import with_input_files, with_paths
 from touchcell.cell.config.layers import load_layers
 from touchcell.cell.config.stopping_distance import StoppingDistance, combined, overshoot
@@ -217,6 +216,7 @@ class _Planner:
             return planned
         if problems := unfeasible(file, planned):
             raise InvalidCell(problems)
+        planned = replace(planned, foreseen=tuple(foreseen_trips(file, planned)))
         notes = (*_remarks(file, planned), *(f"{name}: left out, as {reason}" for name, reason in left_out.items()))
         return replace(self._require_armed(planned) if self._prove else planned, notes=notes)
 
@@ -456,12 +456,12 @@ class _Planner:
             self._add(tuple(error.key.split(".")), error.reason, value=error.value, hint=error.hint)
             raise InvalidCell(self._problems) from None
         # What cannot trip is shown nothing that must not trip it.
-        healthy = (trips(plan, facts) for trips in (trips_when_healthy, trips_in_motion))
-        for problem in list(not_armed(plan, facts, proofs)) or itertools.chain.from_iterable(healthy):
+        for problem in list(not_armed(plan, facts, proofs)) or trips_when_healthy(plan, facts):
             self._add(problem.path, problem.reason, hint=problem.hint)
         if self._problems:
             raise InvalidCell(self._problems)
-        return replace(plan, proofs=proofs)
+        foreseen = (self._file.problem(each.path, each.reason, hint=each.hint) for each in trips_in_motion(plan, facts))
+        return replace(plan, proofs=proofs, foreseen=(*plan.foreseen, *foreseen))
 
     def _require_data_is_used(self, cell: CellFile, devices: Mapping[str, DevicePlan]) -> None:
         """A data set that is given exists, and something reads it or writes it."""
