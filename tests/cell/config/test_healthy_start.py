@@ -41,11 +41,9 @@ def said(tmp_path: Path) -> Callable[[dict[str, Any]], dict[str, str]]:
         path = tmp_path / "cell.yaml"
         path.write_text(yaml.safe_dump(data, sort_keys=False))
         try:
-            plan_cell(path)
+            problems = plan_cell(path).foreseen
         except InvalidCell as error:
             problems = error.problems
-        else:
-            problems = ()
         assert all(problem.line > 0 for problem in problems)
         return {problem.key: str(problem) for problem in problems}
 
