@@ -21,7 +21,8 @@ def test_the_task_is_killed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     dead = subprocess.run(command, capture_output=True, text=True, timeout=100, check=False)
     assert dead.returncode < 0, dead.stdout + dead.stderr
     _, messages = read_left_ring(out)
-    assert len(messages) == 60
+    # The messages of a cycle are kept together.
+    assert 60 <= len(messages) < 80
     assert main(["why", str(out)]) == EXIT_OK
     told = capsys.readouterr().out
     assert "ended without a result" in told

@@ -118,7 +118,7 @@ TOUCHES = [
     ),
 ]
 TIMES = [
-    (FOLLOW, [("task.max_frame_age_ms", 15)], "task.max_frame_age_ms", "come after 10 ms"),
+    (FOLLOW, [("task.max_frame_age_ms", 5)], "task.max_frame_age_ms", "come after 10 ms"),
     (FOLLOW, [("task.kp_per_s", [0, 0, 300, 8, 8, 0])], "task.kp_per_s", "overshoots by more than the error"),
     (FOLLOW, [("task.kp_per_s", [0, 0, -8, 8, 8, 0])], "task.kp_per_s.2", "greater than or equal to 0"),
 ]
