@@ -26,7 +26,7 @@ _LEAST_GAIN = 0.3
 # learnt them reports several times as much shear. How the sensor is tilted has no such excuse.
 _MOST_GAIN = {"shear": 20.0, "tilt": 3.0}
 # A surface that moves drags the contact until it slides, and its shear then answers to what drags it; the tilt does
-# not slide. In 164 checks on plates in periodic motion, shear that was wrong answered with at most this share of its
+# not slide. In 155 checks on plates in periodic motion, shear that was wrong answered with at most this share of its
 # drift above the least gain.
 _DRIFT_GAIN = {"shear": 0.2, "tilt": 0.0}
 _SURE = 2.5
