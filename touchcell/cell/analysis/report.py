@@ -18,7 +18,7 @@ from touchcell.cell.config.cell_plan import CellPlan
 from touchcell.cell.recording.mcap import RECORDING
 from touchcell.cell.recording.messages import COMPONENTS
 from touchcell.cell.runtime.operator_input import is_running
-from touchcell.cell.runtime.result_record import RESULT
+from touchcell.cell.runtime.result_record import KILLED, RESULT
 from touchcell.cell.scene.description import SceneDescription, describe_scene
 from touchcell.errors import ConfigError, TouchcellError
 from touchcell.geometry.types import Array
@@ -234,7 +234,7 @@ def _without_result(folder: Path) -> str:
         return "it is in progress"
     if (folder / RESULT).exists():
         return f"{RESULT} is damaged"
-    return "it was killed, crashed, or there was no memory left"
+    return KILLED
 
 
 def _text(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,7 +14,7 @@ from numpy.typing import NDArray
 from touchcell.cell.analysis.run_data import Run, Series, load_run, tip_points
 from touchcell.cell.config.cell_plan import CellPlan
 from touchcell.cell.config.schema import plan_cell
-from touchcell.cell.runtime.result_record import RESULT
+from touchcell.cell.runtime.result_record import RESULT, read_record
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 
@@ -34,11 +33,7 @@ class RunFolder:
     @cached_property
     def result(self) -> dict[str, Any]:
         """How it ended, as ``result.json`` says; empty where there is none that can be read."""
-        try:
-            found = json.loads((self.path / RESULT).read_text())
-        except (OSError, ValueError, RecursionError):
-            return {}
-        return found if isinstance(found, dict) else {}
+        return read_record(self.path / RESULT)
 
     @cached_property
     def recording(self) -> Run:

@@ -17,7 +17,7 @@ from touchcell.cell.errors import RecordingError
 from touchcell.cell.recording.mcap import RECORDING
 from touchcell.cell.runtime.black_box import ABOUT, CRASH, MESSAGES, RING, read_left_ring
 from touchcell.cell.runtime.operator_input import is_running
-from touchcell.cell.runtime.result_record import RESULT
+from touchcell.cell.runtime.result_record import KILLED, RESULT, read_record
 from touchcell.cell.runtime.watchdog import NOTES
 from touchcell.errors import ConfigError
 from touchcell.geometry.types import Array
@@ -107,28 +107,20 @@ def _tripped(folder: Path, run: Run, cause: dict[str, Any]) -> WatchedQuantity |
         return None
 
 
-_DIED: Final = "the run's process ended without a result: it was killed, crashed, or there was no memory left"
+_DIED: Final = f"the run's process ended without a result: {KILLED}"
 
 
 def _evidence(folder: Path) -> _Evidence | None:
     if (folder / RING).exists():
         about, messages = read_left_ring(folder)
         return _Evidence(about, run_of(messages), RING)
-    if (about := _record(folder / ABOUT)) and (folder / MESSAGES).exists():
+    if (about := read_record(folder / ABOUT)) and (folder / MESSAGES).exists():
         return _Evidence(about, load_run(folder / MESSAGES), MESSAGES)
+    # A black box that cannot be read leaves the answer to the recording.
     about = RunFolder(folder).result
     if (folder / RECORDING).exists():
         return _Evidence(about, load_run(folder / RECORDING), RECORDING)
     return _Evidence(about, run_of([]), RESULT) if about else None
-
-
-def _record(file: Path) -> dict[str, Any]:
-    """Return what a black box is of; empty where nothing can be read, so that the recording answers in its place."""
-    try:
-        about = json.loads(file.read_text())
-    except (OSError, ValueError, RecursionError):
-        return {}
-    return about if isinstance(about, dict) else {}
 
 
 def _crash(file: Path) -> list[str]:

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from touchcell.cell.config.demands import demands
-from touchcell.cell.config.feasible_motion import places_outside
 from touchcell.cell.config.rule_limits import is_kind, limits_of
 from touchcell.cell.config.starts import pose_of, start_of_arm
 from touchcell.cell.config.yaml_file import YamlFile
@@ -34,7 +33,7 @@ _LONGEST_HEADER: Final = 100 << 20
 
 def unfeasible(file: YamlFile, plan: CellPlan) -> list[ConfigError]:
     """Return one problem for everything that ``plan`` would be refused for, or would surely trip or fail on."""
-    problems = [
+    return [
         *_models(file, plan),
         *(scene := list(_scene(file, plan))),
         *_features(file, plan),
@@ -45,8 +44,6 @@ def unfeasible(file: YamlFile, plan: CellPlan) -> list[ConfigError]:
         *(starts := list(_starts(file, plan))),
         *(() if starts or scene else _contacts(file, plan)),
     ]
-    # A run that is refused anyway is not followed.
-    return problems or list(places_outside(file, plan))
 
 
 def _models(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -43,10 +43,16 @@ _WAY_SLACK_MM: Final = 5.0
 """By which a way over a surface may be elsewhere: the sensor turns with the surface a little late."""
 
 
-def foreseen_trips(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
+Ways = Mapping[KeyPath, Array]
+"""Ways (n, 3), m, of the sensor over surfaces of the scene, in the base frame of its arm, by the task's key."""
+
+
+def foreseen_trips(file: YamlFile, plan: CellPlan, ways: Ways) -> Iterator[ConfigError]:
     """Return one problem for every parameter of a task with which each run would trip; else nothing is wrong."""
-    for problems in (_ages, _gates, _too_light, _gains, _pressing, _ways_out, _untouched):
+    for problems in (_ages, _gates, _too_light, _gains, _pressing):
         yield from problems(file, plan)
+    yield from _ways_out(file, plan, ways)
+    yield from _untouched(file, plan)
 
 
 def failing_motions(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
@@ -58,7 +64,7 @@ def failing_motions(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
         yield from problems(file, plan)
 
 
-def places_outside(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
+def places_outside(file: YamlFile, plan: CellPlan, ways: Ways) -> Iterator[ConfigError]:
     """Return one problem for every place to which the task surely takes an arm, outside a box that it must not leave.
 
     A way over a known surface is known better than by the plane of the first contact, and left to ``foreseen_trips``.
@@ -66,7 +72,6 @@ def places_outside(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
     if not plan.sensor_roles:
         return
     start, mount = start_of_sensor(plan)
-    ways = dict(_ways(plan))
     reported: set[KeyPath] = set()
     for place in () if plan.task.places is None else plan.task.places(plan.task_config, start, mount):
         for rule, box in _boxes(plan).items():
@@ -88,11 +93,11 @@ def _boxes(plan: CellPlan) -> dict[str, Any]:
     return {rule: box for rule, box in plan.cell.interlocks.items() if is_kind(box, "workspace")}
 
 
-def _ways_out(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
+def _ways_out(file: YamlFile, plan: CellPlan, ways: Ways) -> Iterator[ConfigError]:
     """Ways over surfaces of the scene, out of a box that the arm must not leave."""
     boxes = _boxes(plan)
     reported: set[KeyPath] = set()
-    for key, way_m in _ways(plan) if plan.sensor_roles else ():
+    for key, way_m in ways.items():
         for rule, box in boxes.items():
             beyond = np.maximum(np.array(box.min_mm) - 1e3 * way_m, 1e3 * way_m - np.array(box.max_mm))
             left = np.flatnonzero((beyond > _WAY_SLACK_MM).any(axis=1))
@@ -116,8 +121,12 @@ def _outside(point_mm: Array, box: Any, slack_mm: float) -> str:
     )
 
 
+def ways_over(plan: CellPlan) -> Ways:
+    """Return the ways over surfaces that are known from the start."""
+    return dict(_ways(plan)) if plan.sensor_roles else {}
+
+
 def _ways(plan: CellPlan) -> Iterator[tuple[KeyPath, Array]]:
-    """Ways (n, 3), m, of the sensor over surfaces of the scene, in the base frame of its arm, by the task's key."""
     start, mount = start_of_sensor(plan)
     reach_mm = getattr(plan.task_config, "approach_distance_mm", None)
     if plan.cell.scene is None or plan.task.motions is None or start is None or reach_mm is None:
@@ -126,25 +135,21 @@ def _ways(plan: CellPlan) -> Iterator[tuple[KeyPath, Array]]:
     base = None if arm is None else pose_of(plan.cell.arms[arm].base_pose_mm_deg)
     if base is None:
         return
-    scene = scene_section().model_validate(plan.cell.scene)
+    scene, tip, reach_m = scene_section().model_validate(plan.cell.scene), base @ start @ mount, 1e-3 * reach_mm
+    retract_m = 1e-3 * float(getattr(plan.task_config, "retract_mm", 0.0))
     for motion in plan.task.motions(plan.task_config, start, mount):
-        if isinstance(motion, PlannedSlide) and motion.known:
-            tip, corners_m = base @ start @ mount, np.array(motion.corners_m)
-            if motion.corners_m:
-                way = scene.points_over(tip, corners_m, motion.depth_m, 1e-3 * reach_mm)
-            else:
-                retract_m = 1e-3 * float(getattr(plan.task_config, "retract_mm", 0.0))
-                way = scene.way_over(
-                    tip, motion.direction_rad, motion.distance_m, motion.depth_m, 1e-3 * reach_mm, retract_m
-                )
-                if way is not None:
-                    yield motion.key, (way[:-1] - base[:3, 3]) @ base[:3, :3]
-                    yield ("retract_mm",), (way[-1:] - base[:3, 3]) @ base[:3, :3]
-                continue
+        if isinstance(motion, PlannedSlide) and motion.known and motion.corners_m:
+            way = scene.points_over(tip, np.array(motion.corners_m), motion.depth_m, reach_m)
             if way is not None:
                 yield motion.key, (way - base[:3, 3]) @ base[:3, :3]
+        elif isinstance(motion, PlannedSlide) and motion.known:
+            way = scene.way_over(tip, motion.direction_rad, motion.distance_m, motion.depth_m, reach_m, retract_m)
+            if way is not None:
+                inner = (way - base[:3, 3]) @ base[:3, :3]
+                yield motion.key, inner[:-1]
+                yield ("retract_mm",), inner[-1:]
         elif isinstance(motion, PlannedRide):
-            way = scene.ride(base @ start @ mount, 1e-3 * reach_mm, motion.lasts_s)
+            way = scene.ride(tip, reach_m, motion.lasts_s)
             if way is not None:
                 # The contact is made a little later, when the surface has moved on.
                 inner = (way - base[:3, 3]) @ base[:3, :3]

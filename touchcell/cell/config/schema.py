@@ -30,7 +30,7 @@ from touchcell.cell.config.cell_plan import (
     SensorSection,
 )
 from touchcell.cell.config.feasibility import unfeasible
-from touchcell.cell.config.feasible_motion import failing_motions, foreseen_trips
+from touchcell.cell.config.feasible_motion import failing_motions, foreseen_trips, places_outside, ways_over
 from touchcell.cell.config.input_files import with_input_files, with_paths
 from touchcell.cell.config.layers import load_layers
 from touchcell.cell.config.stopping_distance import StoppingDistance, combined, overshoot
@@ -216,7 +216,10 @@ class _Planner:
             return planned
         if problems := unfeasible(file, planned):
             raise InvalidCell(problems)
-        planned = replace(planned, foreseen=tuple(foreseen_trips(file, planned)))
+        ways = ways_over(planned)
+        if problems := list(places_outside(file, planned, ways)):
+            raise InvalidCell(problems)
+        planned = replace(planned, foreseen=tuple(foreseen_trips(file, planned, ways)))
         notes = (*_remarks(file, planned), *(f"{name}: left out, as {reason}" for name, reason in left_out.items()))
         return replace(self._require_armed(planned) if self._prove else planned, notes=notes)
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any, Final
 
 from touchcell.cell.config.cell_plan import CellPlan
@@ -10,6 +12,17 @@ from touchcell.cell.runtime.black_box import cause_record, stop_record
 from touchcell.cell.runtime.run_result import Outcome, RunResult
 
 RESULT: Final = "result.json"
+KILLED: Final = "it was killed, crashed, or there was no memory left"
+"""Why a run that is not in progress has no result."""
+
+
+def read_record(file: Path) -> dict[str, Any]:
+    """Return a record of a run, as of its result or its black box; empty where none can be read."""
+    try:
+        found = json.loads(file.read_text())
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return found if isinstance(found, dict) else {}
 
 
 def result_record(plan: CellPlan, result: RunResult) -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import subprocess
 import sys
 from collections import OrderedDict
@@ -15,6 +14,7 @@ from typing import Final
 from touchcell.cell.recording.mcap import RECORDING
 from touchcell.cell.runtime.operator_channel import OperatorRequest, ask_run, operator_name
 from touchcell.cell.runtime.operator_input import NoSuchRun, ask_to_stop, is_running
+from touchcell.cell.runtime.result_record import RESULT, read_record
 from touchcell.cell.ui.run_view import RunView, sources
 from touchcell.paths import CONFIGS
 
@@ -163,8 +163,4 @@ class Runs:
 
 def outcome(folder: Path) -> str:
     """Return how the run in a folder has ended; empty while it has not."""
-    try:
-        found = json.loads((folder / "result.json").read_text()).get("outcome", "")
-    except (OSError, ValueError, AttributeError):
-        return ""
-    return str(found)
+    return str(read_record(folder / RESULT).get("outcome", ""))
