@@ -4,18 +4,23 @@ TORCH ?= torch==2.13.0
 BIN := .venv/bin
 SOURCES := pyproject.toml setup.py $(wildcard touchcell/*/*.[ch] touchcell/*/*/*.[ch])
 
-.PHONY: demo test check fast stress docs clean
+.PHONY: demo test check fast exhaustive stress docs clean
 
 demo: .venv/core
 	$(BIN)/touchcell run configs/dual_push_sim.yaml --animate
 
 # Tests beside emulators one after another, since they have deadlines; the others on all cores.
 test: check
-	TOUCHCELL_REQUIRE_COMPILED=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto -m "not emulated and not stress"
-	TOUCHCELL_REQUIRE_COMPILED=1 $(BIN)/python -m pytest -m "emulated and not stress"
+	TOUCHCELL_REQUIRE_COMPILED=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto -m "not emulated and not exhaustive and not stress"
+	TOUCHCELL_REQUIRE_COMPILED=1 $(BIN)/python -m pytest -m "emulated and not exhaustive and not stress"
 
 fast: .venv/dev
-	$(BIN)/python -m pytest -m "not slow and not stress"
+	$(BIN)/python -m pytest -m "not slow and not exhaustive and not stress"
+
+# What `make test` takes samples of, whole: every shipped cell, page, combination of faults, version of Python.
+exhaustive: .venv/dev
+	TOUCHCELL_REQUIRE_COMPILED=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto -m "exhaustive and not emulated"
+	TOUCHCELL_REQUIRE_COMPILED=1 $(BIN)/python -m pytest -m "exhaustive and emulated"
 
 # Half an hour; `make stress STEPS=100000` takes a few minutes.
 STEPS ?= 10000000

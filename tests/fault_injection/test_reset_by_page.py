@@ -11,6 +11,7 @@ import select
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ import pytest
 import yaml
 
 from tests.fault_injection.fault_matrix import SETTINGS_OF_STATES, cells, composed, on_true_contact
+from tests.helpers.sampling import sampled
 from touchcell.cell.runtime.cell import Cell
 from touchcell.cell.runtime.loop import RunLoop
 from touchcell.cell.runtime.operator_channel import OperatorChannel, OperatorRequest
@@ -211,8 +213,7 @@ def reset_moves_nothing(run: OperatedByPage, state: str, faults: ArmFaults) -> N
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("trip", TRIPS)
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize(("task", "trip"), sampled(product(TASKS, TRIPS), len(TASKS) + 1))
 def test_nothing_moves_between_a_trip_in_any_state_and_a_confirmed_resume(
     task: str, trip: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.helpers.sampling import sampled
 from tests.packaging.conftest import Distributions
 from tests.packaging.environments import Environment, interpreter
 from touchcell.paths import CHECKOUT
@@ -93,7 +94,7 @@ def test_the_build_warns_of_no_package_that_it_leaves_out(distributions: Distrib
     assert "is absent from the `packages` configuration" not in distributions.log
 
 
-@pytest.mark.parametrize("version", PYTHONS)
+@pytest.mark.parametrize("version", sampled(PYTHONS, 1))
 def test_the_sdist_builds_and_checks_a_cell_on(version: str, distributions: Distributions, tmp_path: Path) -> None:
     python = interpreter(version)
     if python is None:

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 import yaml
 
+from tests.helpers.sampling import sampled
 from touchcell.cell.cli.exit_codes import EXIT_BAD_INPUT, EXIT_OK
 from touchcell.cell.cli.main import main
 from touchcell.paths import CONFIGS
@@ -58,15 +59,18 @@ def test_it_is_green_in_simulation_and_leaves_evidence(module: Path, tmp_path: P
 
 @pytest.mark.parametrize(
     ("name", "change"),
-    [
-        ("stale_arm", None),
-        ("stale_arm", {"limit_ms": 800}),
-        ("tilt", {"limit_deg": 60}),
-        ("tcp_speed", {"limit_m_s": 0.25}),
-        ("workspace", {"max_mm": [610, -50, 460]}),
-        ("uncertain", {"hold_ms": 1500}),
-        ("shear", {"severity": "limit"}),
-    ],
+    sampled(
+        [
+            ("stale_arm", None),
+            ("stale_arm", {"limit_ms": 800}),
+            ("tilt", {"limit_deg": 60}),
+            ("tcp_speed", {"limit_m_s": 0.25}),
+            ("workspace", {"max_mm": [610, -50, 460]}),
+            ("uncertain", {"hold_ms": 1500}),
+            ("shear", {"severity": "limit"}),
+        ],
+        3,
+    ),
 )
 def test_a_cell_that_is_protected_less_is_red(module: Path, name: str, change: dict[str, Any] | None) -> None:
     changed(module, name, change)

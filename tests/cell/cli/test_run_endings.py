@@ -90,8 +90,7 @@ def run_into(path: Path, folder: Path, stdout: int | IO[str], stderr: int | IO[s
     return subprocess.run(command, stdin=subprocess.DEVNULL, stdout=stdout, stderr=stderr, check=False).returncode
 
 
-@pytest.mark.parametrize("output", ["closed pipe", "/dev/full"])
-@pytest.mark.parametrize("limit_mm", [0.25, 6.0])
+@pytest.mark.parametrize(("output", "limit_mm"), [("closed pipe", 0.25), ("/dev/full", 6.0)])
 def test_the_exit_code_is_the_same_whatever_becomes_of_the_output(tmp_path: Path, output: str, limit_mm: float) -> None:
     path, folder = (
         cell(tmp_path, interlocks__shear__limit_mm=limit_mm, interlocks__shear__hold_ms=0),

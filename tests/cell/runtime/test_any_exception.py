@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 from collections.abc import Callable
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import pytest
 import yaml
 
 from tests.helpers.pushing_cell import cell_file
+from tests.helpers.sampling import sampled
 from touchcell.cell.cli import run as run_command
 from touchcell.cell.cli.exit_codes import EXIT_DEVICE_LOST, EXIT_TASK_FAILED, EXIT_TRIPPED
 from touchcell.cell.config.schema import plan_cell
@@ -132,8 +134,7 @@ def cell_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.mark.parametrize("kind", EXCEPTIONS)
-@pytest.mark.parametrize("place", PLACES)
+@pytest.mark.parametrize(("place", "kind"), sampled(product(PLACES, EXCEPTIONS), 2 * len(PLACES) + 1))
 def test_an_exception_stops_every_arm_in_the_same_moment(
     tmp_path: Path, cell_path: Path, place: str, kind: str
 ) -> None:
@@ -168,8 +169,10 @@ def test_an_exception_stops_every_arm_in_the_same_moment(
         fault.armed = False
 
 
-@pytest.mark.parametrize("kind", ["ValueError", "DeviceGone"])
-@pytest.mark.parametrize("place", [place for place in PLACES if place not in HARMLESS])
+@pytest.mark.parametrize(
+    ("place", "kind"),
+    sampled(product([place for place in PLACES if place not in HARMLESS], ["ValueError", "DeviceGone"]), 11),
+)
 def test_the_command_leaves_a_result_a_black_box_and_the_right_exit_code(
     tmp_path: Path, cell_path: Path, monkeypatch: pytest.MonkeyPatch, place: str, kind: str
 ) -> None:

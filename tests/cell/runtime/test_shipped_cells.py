@@ -16,10 +16,14 @@ SIMULATED = sorted(
     # Data collection has thousands of contacts; tests/tasks has a few of them.
     if file.stem != "collect_sim"
 )
+LONG = ("dual_push_sim", "dual_push_tall_sim", "object_track_panda_sim")
+"""Thousands of cycles of two arms, or of joints; cells like them run in tests/tasks."""
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", SIMULATED)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.exhaustive] * (name in LONG)) for name in SIMULATED]
+)
 def test_a_shipped_cell_ends_as_done(name: str, tmp_path: Path) -> None:
     data = yaml.safe_load((CONFIGS / f"{name}.yaml").read_text())
     assert data.get("time", "simulated") == "simulated"
