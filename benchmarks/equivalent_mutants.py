@@ -58,6 +58,45 @@ EQUIVALENT: Mapping[tuple[str, str, str], str] = {
     ("collision", "_TINY = 1e-30", "1e-30 -> 2e-30"): "only keeps a division by zero away",
     ("collision", "if i.size:", "if -> if True"): SHORTCUT,
     ("collision", "if k.size:", "if -> if True"): SHORTCUT,
+    (
+        "collision",
+        "s = np.where(slant > 1e-12 * uu * vv, uv * vw - vv * uw, 0.0) / np.maximum(slant, _TINY)",
+        "Gt -> GtE",
+    ): (EXACT),
+    (
+        "collision",
+        "s = np.where(slant > 1e-12 * uu * vv, uv * vw - vv * uw, 0.0) / np.maximum(slant, _TINY)",
+        "1e-12 -> 2e-12",
+    ): "of lines that are parallel to a millionth all points are equally near to a micrometre",
+    ("collision", "at = np.zeros((len(p), 8))", "8 -> 16"): "what it adds is the start of the segment once more",
+    ("clearance", "if not np.min(apart, initial=np.inf) < self.slow_m:", "if -> if False"): SHORTCUT,
+    ("clearance", "if not np.min(apart, initial=np.inf) < self.slow_m:", "Lt -> LtE"): SHORTCUT,
+    (
+        "clearance",
+        "change = self.clearances.distances(self._frames(view, _AHEAD_S)) - apart if commanded "
+        "else np.zeros_like(apart)",
+        "x if c else y -> c = True",
+    ): "without a command nothing moves ahead",
+    ("clearance", "wrong = (apart < self.slow_m) & (change < -_NEGLIGIBLE_M)", "Lt -> LtE"): EXACT,
+    (
+        "clearance",
+        "parting = (change >= REST_M_S * _AHEAD_S) & (measured > -2.0 * REST_M_S * _AHEAD_S)",
+        "GtE -> Gt",
+    ): EXACT,
+    (
+        "clearance",
+        "parting = (change >= REST_M_S * _AHEAD_S) & (measured > -2.0 * REST_M_S * _AHEAD_S)",
+        "Gt -> GtE",
+    ): EXACT,
+    ("clearance", "if (too_near := apart < self.limit_m).any():", "Lt -> LtE"): EXACT,
+    ("clearance", "too_near = apart_m < self.limit_m", "Lt -> LtE"): EXACT,
+    ("clearance", "if widest_m <= slow_m and least_m > widest_m:", "LtE -> Lt"): EXACT,
+    ("clearance", "if widest_m <= slow_m and least_m > widest_m:", "Gt -> GtE"): EXACT,
+    ("clearance", "if distance < limit_m:", "Lt -> LtE"): EXACT,
+    ("clearance", "if widest_m > slow_m and len(near) == len(bodies):", "Gt -> GtE"): EXACT,
+    ("clearance", "if widest_m > slow_m and len(near) == len(bodies):", "if -> if False"): SHORTCUT,
+    ("clearance", "if number % 2 or np.linalg.norm(placed[:3, 3]) > reach_m:", "Gt -> GtE"): EXACT,
+    ("depth_disagrees", "if slid_m > self.slide_m:", "Gt -> GtE"): EXACT,
     ("motion", "command = TwistCommand(twist, TwistFrame.BASE, view.now_ns, 0.03)", "0.03 -> 0.06"): (
         "nothing reads the time-to-live of a fault's command"
     ),

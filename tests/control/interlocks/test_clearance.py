@@ -97,6 +97,38 @@ def test_two_arms_slow_down_then_stop_and_may_always_separate(gap_mm, left, righ
         assert "'s finger" in found.reason
 
 
+@pytest.mark.parametrize(("um_s", "severity"), [(9.0, None), (11.0, Severity.LIMIT)])
+def test_closing_by_a_ten_millionth_of_a_metre_in_ten_milliseconds_counts(um_s, severity):
+    found = rule().check(apart(50, (1e-6 * um_s, 0, 0, 0, 0, 0)))
+    assert (found and found.severity) == severity
+
+
+@pytest.mark.parametrize(
+    ("back_mm_s", "measured_mm_s", "severity"),
+    [
+        (0.9, 0.0, Severity.TRIP),
+        (1.1, 0.0, None),
+        (50.0, -1.9, None),
+        (50.0, -2.1, Severity.TRIP),
+        (50.0, 60.0, None),
+    ],
+)
+def test_too_near_they_part_faster_than_standing_still_and_are_not_measured_to_close(
+    back_mm_s, measured_mm_s, severity
+):
+    view = apart(19, (-1e-3 * back_mm_s, 0, 0, 0, 0, 0))
+    left = view.arms["left"]
+    moving = TcpState(left.state.value.T_base_tcp, np.array([-1e-3 * measured_mm_s, 0, 0, 0, 0, 0]))
+    view = replace(view, arms={**view.arms, "left": replace(left, state=Stamped(moving, NOW, 1))})
+    found = rule().check(view)
+    assert (found and found.severity) == severity
+
+
+def test_what_is_told_is_the_limit_that_counts():
+    assert rule().check(apart(19, FORTH)).reason.endswith("'s finger, limit 20 mm")
+    assert rule().check(apart(21, FORTH)).reason.endswith("'s finger, slow below 60 mm")
+
+
 def test_the_sensor_turning_towards_the_other_counts_as_approach():
     # Lying along y, the left finger sweeps its end towards the right arm.
     view = apart(30, None, None)

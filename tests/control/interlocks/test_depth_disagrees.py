@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from touchcell.control.interlocks.config import build_interlocks, parse_interlocks
-from touchcell.control.interlocks.coverage import ArmFacts, CellFacts, SensorFacts
+from touchcell.control.interlocks.coverage import ArmFacts, CellFacts, Fault, SensorFacts
+from touchcell.control.interlocks.depth_disagrees import DepthDisagreesConfig
 from touchcell.control.interlocks.snapshot import ArmView, CellView, SensorView
 from touchcell.control.interlocks.timers import InterlockState
 from touchcell.control.interlocks.violation import Violation
@@ -194,3 +195,56 @@ def test_it_is_proven_on_a_mount_that_points_sideways(limits: TwistLimits | None
         (interlock,) = build_interlocks(settings, {"sensor": mount})
         found = prove("it", settings["it"], interlock, facts)
         assert all(proof.problem == "" for proof in found) == armed, found
+
+
+def test_a_contact_that_began_elsewhere_is_as_deep_as_estimated() -> None:
+    press = Press()
+    for _ in range(2):
+        assert press(4.0, 4.0, state="run") is None
+    assert press(4.0, 4.0) is None
+    assert press(6.9, 4.0) is None
+    assert press(7.1, 4.0) is not None
+
+
+def test_it_slides_five_millimetres_by_default() -> None:
+    settings = parse_interlocks({"it": {each: ENTRY[each] for each in ("kind", "limit_mm", "states")}})["it"]
+    assert isinstance(settings, DepthDisagreesConfig)
+    assert settings.slide_mm == 5.0
+
+
+@pytest.mark.parametrize(
+    ("limits", "speed_mm_s"), [(TwistLimits(0.02, 0.5, 0.5, 2.5, 50.0, 250.0), 20.0), (None, 100.0)]
+)
+@pytest.mark.parametrize("stiffness_n_mm", [None, 2.0])
+def test_the_faults_press_in_at_the_speed_of_the_gate_with_the_force_that_was_configured(
+    limits: TwistLimits | None, speed_mm_s: float, stiffness_n_mm: float | None
+) -> None:
+    mount = se3.from_euler_mm_deg(np.array([20.0, 30.0, 60.0, 70.0, 20.0, 0]))
+    facts = CellFacts(
+        0.01,
+        ("press",),
+        {"arm": ArmFacts(limits, 1.0, wrench=True)},
+        {"sensor": SensorFacts("network", "arm", mount, 7e-3, 6e-3, 0.1)},
+    )
+    settings = DepthDisagreesConfig.model_validate({**ENTRY, "stiffness_n_mm": stiffness_n_mm})
+    cases = tuple(settings.faults(facts))
+    healthy = facts.healthy(START_NS, "press")
+    by_travel = cases[0]
+    assert isinstance(by_travel, Fault)
+    for t_s in (0.0, 0.05, 0.1, 10.0):
+        travel_mm = min(speed_mm_s * t_s, 25.0)
+        shown = by_travel.change(healthy, t_s)
+        T_base_tcp = shown.arms["arm"].state.value.T_base_tcp
+        np.testing.assert_allclose(1e3 * T_base_tcp[:3, 3], travel_mm * mount[:3, 2], atol=1e-9)
+        wrench = shown.arms["arm"].wrench
+        assert shown.sensors["sensor"].depth_m == pytest.approx(1e-3 * min(travel_mm, 3.5))
+        assert (wrench is None) == (stiffness_n_mm is None)
+        if wrench is not None and stiffness_n_mm is not None:
+            force_n = 1e3 * min(1e-3 * travel_mm, 3.5e-3) * stiffness_n_mm
+            np.testing.assert_allclose(wrench.value, [*(-force_n * mount[:3, 2]), 0.0, 0.0, 0.0], atol=1e-9)
+    assert len(cases) == (1 if stiffness_n_mm is None else 2)
+    for by_force in cases[1:]:
+        assert isinstance(by_force, Fault)
+        wrench = by_force.change(healthy, 0.0).arms["arm"].wrench
+        assert wrench is not None
+        np.testing.assert_allclose(wrench.value, [*(-50.0 * mount[:3, 2]), 0.0, 0.0, 0.0], atol=1e-9)

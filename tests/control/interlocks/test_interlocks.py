@@ -208,6 +208,13 @@ def test_anything_not_finite_is_found(bad, place):
     assert Finite().check(view(command=(1,) * 6, nis=3.0, sigma_depth_m=1e-4)) is None
 
 
+def test_infinities_that_cancel_are_found_and_finite_numbers_whose_sum_is_too_large_are_not():
+    found = Finite().check(view(nis=math.inf, shear_m=-math.inf))
+    assert found is not None
+    assert found.reason == "innovation is not finite"
+    assert Finite().check(view(nis=1.7e308, shear_m=1.7e308)) is None
+
+
 @pytest.mark.parametrize(
     ("entry", "key"),
     [

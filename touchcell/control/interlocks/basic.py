@@ -45,6 +45,12 @@ class Finite:
     severity: Severity = Severity.FAULT
 
     def check(self, view: CellView) -> Violation | None:
+        # A sum of floats is finite only if all of them are; one that overflows is looked at below like any other.
+        total = 0.0
+        for _, _, _, value in self._numbers(view):
+            total += value if isinstance(value, float) else sum(np.asarray(value).ravel().tolist())
+        if math.isfinite(total):
+            return None
         for role, frame_seq, what, value in self._numbers(view):
             if not (math.isfinite(value) if isinstance(value, float) else all_finite(np.asarray(value))):
                 reason = f"{what} is not finite"

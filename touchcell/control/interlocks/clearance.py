@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Literal, Self
 
@@ -11,7 +12,7 @@ import numpy as np
 from pydantic import PositiveFloat, model_validator
 
 from touchcell.control.interlocks.boundary import REST_M_S
-from touchcell.control.interlocks.collision import Clearances, Pair
+from touchcell.control.interlocks.collision import TOOL, Clearances, Pair
 from touchcell.control.interlocks.coverage import (
     CannotTrip,
     CellFacts,
@@ -148,13 +149,12 @@ def _search(
     """Return, for each arm, a pose of the cell in which it is too near to something, and one in which nothing is."""
     bodies = facts.scene.bodies
     rng = np.random.default_rng(0)
-    targets = [box.T_world_box[:3, 3] for box in facts.scene.boxes]
-    targets += [body.T_world_base[:3, 3] for body in bodies.values()]
+    places = _Places(facts)
     near: dict[str, Change] = {}
     apart: Change = unchanged
     widest_m = -math.inf
     for k in range(_TRIED):
-        posed = _Posed({role: _random_pose(role, facts, targets, k, rng) for role in bodies})
+        posed = _Posed({role: _random_pose(role, facts, places, k, rng) for role in bodies})
         view = posed(facts.healthy(0, ""), 0.0)
         frames = [body.frames(view.arms[role]) for role, body in bodies.items()]
         distances = clearances.distances(np.concatenate(frames))
@@ -184,18 +184,47 @@ class _Posed:
         return view
 
 
+class _Places:
+    """Places in the world where an arm may meet something: where a box is nearest, where two arms reach, and bases."""
+
+    def __init__(self, facts: CellFacts) -> None:
+        self._boxes = facts.scene.boxes
+        bases = {role: body.T_world_base[:3, 3] for role, body in facts.scene.bodies.items()}
+        between = []
+        for (one, first), (other, second) in itertools.combinations(bases.items(), 2):
+            reach_m, other_m = facts.arms[one].reach_m, facts.arms[other].reach_m
+            between.append(first + (second - first) * reach_m / (reach_m + other_m))
+        self._points = [*between, *bases.values()]
+
+    def __getitem__(self, number: int) -> Callable[[Array], Array]:
+        """Return the place with that number, counted round and round, for an arm whose base is at a point (3,)."""
+        k = number % (len(self._boxes) + len(self._points))
+        if k >= len(self._boxes):
+            return lambda base: self._points[k - len(self._boxes)]
+        T, half_m = self._boxes[k].T_world_box, self._boxes[k].half_m
+
+        def nearest(base: Array) -> Array:
+            point: Array = T[:3, :3] @ np.clip(T[:3, :3].T @ (base - T[:3, 3]), -half_m, half_m) + T[:3, 3]
+            return point
+
+        return nearest
+
+
 def _random_pose(
-    role: str, facts: CellFacts, targets: Sequence[Array], number: int, rng: np.random.Generator
+    role: str, facts: CellFacts, places: _Places, number: int, rng: np.random.Generator
 ) -> tuple[Array, Array | None]:
-    """Return a pose of one arm: in turns anywhere within reach, and with its tool at what it could collide with."""
+    """Return a pose of one arm: in turns anywhere within reach, and with a part of its tool where it may collide."""
     body = facts.scene.bodies[role]
     if (ik := body.kinematics()) is not None:
         q = rng.uniform(ik.chain.lower, ik.chain.upper)
         return ik.chain.forward(q), q
     reach_m = facts.arms[role].reach_m
-    T = np.eye(4)
-    T[:3, 3] = targets[(number // 2) % len(targets)]
-    placed: Array = se3.inverse(body.T_world_base) @ T
+    parts = [part.ends_m for part in body.capsules if part.frames == (TOOL, TOOL)]
+    middle = np.mean(parts[number // 2 % len(parts)], axis=0) if parts else np.zeros(3)
+    T_base_world = se3.inverse(body.T_world_base)
+    there = T_base_world[:3, :3] @ places[number // 2](body.T_world_base[:3, 3]) + T_base_world[:3, 3]
+    placed: Array = se3.exp(np.concatenate([np.zeros(3), rng.uniform(-math.pi, math.pi, 3)]))
+    placed[:3, 3] = there - placed[:3, :3] @ middle
     if number % 2 or np.linalg.norm(placed[:3, 3]) > reach_m:
         placed[:3, 3] = rng.uniform(-reach_m, reach_m, 3)
     return placed, None
