@@ -24,6 +24,10 @@ from touchcell.perception.models.preprocessing import Preprocessing
 from touchcell.perception.models.transfer_spec import TransferSpec
 
 _HOW_TO_TRAIN = "train one with `touchcell train --data DIR --out NAME.safetensors`"
+_HOW_TO_ADAPT = (
+    "adapt the model of the first sensor again, with the same labelled images: "
+    "`touchcell adapt --model FIRST.safetensors --data DIR --out {out}`"
+)
 FORMAT_VERSION = 1
 _METADATA_KEY = "touchcell"
 _REFERENCE = "reference_image"
@@ -297,7 +301,12 @@ def _parse_header(text: str | None, path: Path) -> Header:
         return Header.model_validate_json(text)
     except ValidationError as error:
         first = error.errors()[0]
-        raise ModelError(path, first["msg"], key=_key(first["type"], first["loc"]), hint="train it again") from error
+        key = _key(first["type"], first["loc"])
+        if first["loc"][0] == "transfer":
+            reason = "adapted to its sensor by another version of touchcell, whose processes have other inputs"
+            hint = _HOW_TO_ADAPT.format(out=path.name)
+            raise ModelError(path, f"{reason} ({first['msg']})", key=key, hint=hint) from error
+        raise ModelError(path, first["msg"], key=key, hint="train it again") from error
 
 
 def _key(error: str, location: tuple[int | str, ...]) -> str:
