@@ -38,6 +38,7 @@ BENCHMARKS = {
     "safety": "tests.fault_injection.safety",
     "safety-against": "benchmarks.safety_against",
     "se3": "benchmarks.se3",
+    "sessions": "benchmarks.sessions",
     "simulation": "benchmarks.simulation",
     "structure": "benchmarks.structure",
     "soak": "tests.fault_injection.soak",
