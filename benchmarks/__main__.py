@@ -29,6 +29,7 @@ BENCHMARKS = {
     "mutation": "benchmarks.mutation",
     "hil-mutation": "benchmarks.hil_mutation",
     "hil-suites": "benchmarks.hil_suites",
+    "perception-against": "benchmarks.perception_against",
     "phantom": "benchmarks.phantom",
     "pictures": "benchmarks.pictures",
     "pushes": "benchmarks.pushes",
