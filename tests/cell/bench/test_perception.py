@@ -47,7 +47,13 @@ def test_without_data_the_shipped_model_is_run_on_simulated_frames(
     assert list(row["stages_ms"]) == ["preprocessing", "network", "Gaussian"]
     assert all(0.0 < stage["median"] <= stage["p99"] for stage in row["stages_ms"].values())
     assert 0.0 < row["start_cpu_s"] < 60.0
-    for name in ("perception.png", "perception_reliability.png", "perception_sim_gdn.png"):
+    assert json.loads((tmp_path / "perception.json").read_text())["bands"]["sim_gdn"]["all"]["n"] == 12
+    for name in (
+        "perception.png",
+        "perception_reliability.png",
+        "perception_reliability_sim_gdn.png",
+        "perception_sim_gdn.png",
+    ):
         assert (tmp_path / name).stat().st_size > 10_000
 
 

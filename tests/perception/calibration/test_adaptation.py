@@ -3,6 +3,7 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -16,8 +17,9 @@ from benchmarks.adapt import _drawn, predicted, second_sensor
 from tests.helpers.marker_samples import SIZE, write_split
 from touchcell.cell.cli.calibrate_sim import calibrate_sim
 from touchcell.cell.cli.train_sim import Imagined, _discs
-from touchcell.drivers.replay.dataset import PUBLIC_CROP
+from touchcell.drivers.replay.dataset import PUBLIC_CROP, REST_IMAGE, read_image
 from touchcell.geometry import se3
+from touchcell.perception.calibration import adaptation
 from touchcell.perception.calibration.adaptation import (
     Adapted,
     AdaptSettings,
@@ -27,12 +29,14 @@ from touchcell.perception.calibration.adaptation import (
     align_camera,
     missing_contacts,
 )
+from touchcell.perception.calibration.transfer_fit import Convention
 from touchcell.perception.errors import ModelError, TrainingError
 from touchcell.perception.markers.detection import Discs
 from touchcell.perception.markers.estimator import MarkerEstimator, matcher_of
 from touchcell.perception.markers.layers import layers_of, outputs_of
 from touchcell.perception.markers.matching import DisplacementModel
 from touchcell.perception.markers.transfer import lattice_symmetries, ring_modes, ring_weights, symmetric_fields
+from touchcell.perception.models.camera_change import CameraChange
 from touchcell.perception.models.labels import contact_from_xi, xi_from_contact
 from touchcell.perception.models.marker_architecture import MarkerArchitecture, MarkerSize
 from touchcell.perception.models.model_file import Header, Labels, Model, load_model, save_model
@@ -176,6 +180,21 @@ def test_adapted_model_is_loaded_from_its_file_and_knows_that_it_was_adapted(
     np.testing.assert_allclose(_mae(loaded, held_out), _mae(adapted.model, held_out))
     with pytest.raises(ModelError, match="adapted already"):
         adapt(tmp_path / "adapted.safetensors", tmp_path, tmp_path / "again.safetensors")
+
+
+def test_the_image_out_of_contact_is_kept_for_the_contact_gate(
+    model: Model, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_split(tmp_path, "train", 2, 1)
+    image = read_image(tmp_path / "train" / "processed_images" / "image_1.png")
+    cv2.imwrite(str(tmp_path / REST_IMAGE), image)
+    save_model(model, tmp_path / "old.safetensors")
+    same_camera = CameraChange(zoom=1.0, turn_deg=0.0, centre_px=(0.0, 0.0), shift_px=(0.0, 0.0), frames=1, rms_px=0.1)
+    mapped = dataclasses.replace(model, header=model.header.model_copy(update={"camera": same_camera}), reference=None)
+    result = Adapted(mapped, "transfer", {}, Convention(False, 0.0, 0.0, 1.0, 1.0), 2, 2, (), (), ())
+    monkeypatch.setattr(adaptation, "adapt_to", lambda *args, **named: result)
+    adapt(tmp_path / "old.safetensors", tmp_path, tmp_path / "new.safetensors")
+    np.testing.assert_array_equal(load_model(tmp_path / "new.safetensors").reference, image)
 
 
 def test_sigma_covers_most_left_out_contacts_of_the_other_sensor(

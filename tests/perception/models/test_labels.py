@@ -7,9 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.perception.models.test_model_file import make_model
 from touchcell.perception.models.labels import XI_UNITS, contact_from_xi, shear_direction, xi_from_contact, xi_gaussian
 from touchcell.perception.models.model_file import Labels
-from touchcell.perception.networks.sigma_scaling import calibrate
+from touchcell.perception.networks.sigma_scaling import OTHER_SESSIONS, calibrate, calibration
 
 LABELS = Labels.of_contacts((-5.0, -4.0, 0.5, -25.0, -24.0, -5.0), (5.0, 4.4, 6.0, 25.0, 26.0, 5.0))
 OTHER = Labels(low=(-0.005, -0.005, -0.006, -0.4, -0.4, -0.1), high=(0.005, 0.005, 0.0, 0.4, 0.4, 0.1))
@@ -78,3 +79,29 @@ def test_calibration_finds_scale_and_power() -> None:
     scale, power = calibrate(residual, np.ones_like(sigma))
     np.testing.assert_array_equal(power, 1.0)
     assert scale[0] == pytest.approx(np.sqrt((residual[:, 0] ** 2).mean()))
+
+
+def test_a_calibration_adds_what_other_sessions_have() -> None:
+    """Sigmas of slipping contacts grow along the shear and in torsion; those of others by the offsets alone."""
+    rng = np.random.default_rng(1)
+    sigma = np.full((4000, 6), 0.02)
+    mean = np.zeros((4000, 6))
+    free, slips = mean[:1].copy(), mean[:1].copy()
+    slips[0, [0, 2, 5]] = 0.8, -0.8, 0.5
+    fields = calibration(LABELS, mean, sigma, mean + rng.normal(0.0, 0.02, (4000, 6)))
+    header = make_model().header.model_copy(update={**fields, "labels": LABELS})
+    more = np.square(header.calibrated(np.full((1, 6), 0.02), slips)) - np.square(
+        header.calibrated(np.full((1, 6), 0.02), free)
+    )
+    contact = LABELS.contacts(slips)[0]
+    assert contact[0] > 2 * OTHER_SESSIONS.free * contact[2]
+    expected = np.zeros(6)
+    expected[0] = OTHER_SESSIONS.slip * np.hypot(*contact[:2])
+    expected[5] = OTHER_SESSIONS.torsion_slip * contact[5]
+    np.testing.assert_allclose(more[0], np.square(expected / LABELS.sigma_unit), atol=1e-12)
+    own = header.calibrated(np.full((1, 6), 0.02), free)[0]
+    offset = np.array(OTHER_SESSIONS.offset_mm_deg) / LABELS.sigma_unit
+    validated = header.model_copy(update={"session": None}).calibrated(np.full(6, 0.02))
+    np.testing.assert_allclose(validated, 0.02, rtol=0.15)
+    np.testing.assert_allclose(own, np.hypot(validated, offset))
+    np.testing.assert_allclose(header.calibrated(np.full(6, 0.02)), own)

@@ -157,3 +157,12 @@ def test_labels_need_a_range() -> None:
     labels = Labels(low=(-1.0, 0.0, 2.0, 0.0, 0.0, 0.0), high=(1.0, 4.0, 3.0, 1.0, 1.0, 1.0))
     np.testing.assert_allclose(labels.centre[:3], [0.0, 2.0, 2.5])
     np.testing.assert_allclose(labels.half_range[:3], [1.0, 2.0, 0.5])
+
+
+def test_a_transfer_of_another_version_asks_to_adapt_again(path: Path) -> None:
+    rewrite(path, header=header_with(transfer={"markers": 331, "contacts": 20}))
+    with pytest.raises(ModelError, match="adapted to its sensor by another version") as caught:
+        load_model(path)
+    assert caught.value.key.startswith("transfer.")
+    assert "touchcell adapt --model" in caught.value.hint
+    assert path.name in caught.value.hint

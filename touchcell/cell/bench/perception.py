@@ -24,6 +24,7 @@ import cv2
 import numpy as np
 
 from touchcell.cell.bench import perception_figures
+from touchcell.cell.bench.perception_bands import PROBABILITIES, band_lines, summaries, write_reliability_by_band
 from touchcell.cell.bench.perception_runtimes import by_turns, installed
 from touchcell.cell.bench.perception_serving import OWN
 from touchcell.cell.bench.perception_validity import validity, validity_lines
@@ -48,7 +49,6 @@ _PARTS = {
     "slipping": "the others, with slip",
     "camera": "the timed frames: images pasted back into camera frames, where they were cropped",
 }
-PROBABILITIES = tuple(np.linspace(0.05, 0.95, 19).round(2).tolist())
 
 
 def run(arguments: Sequence[str], out: Path) -> None:
@@ -73,7 +73,9 @@ def run(arguments: Sequence[str], out: Path) -> None:
         for path in options.models
         if isinstance((model := load_model(path)).header.architecture, Architecture)
     }
-    text = "\n".join([about, table(rows), *_turn_lines(turns), *validity_lines(changed)])
+    by_band = {name: summaries(each) for name, each in scores.items()}
+    bands = (line for name, found in by_band.items() for line in band_lines(name, found))
+    text = "\n".join([about, table(rows), *_turn_lines(turns), *bands, *validity_lines(changed)])
     print(text)
     (out / "perception.txt").write_text(text + "\n")
     report = {
@@ -82,12 +84,15 @@ def run(arguments: Sequence[str], out: Path) -> None:
         "probabilities": PROBABILITIES,
         "rows": rows,
         "by_turns": turns,
+        "bands": by_band,
         "validity": changed,
     }
     (out / "perception.json").write_text(json.dumps(report, indent=1) + "\n")
     perception_figures.write_run_time_against_error(out / "perception.png", rows)
     perception_figures.write_reliability(out / "perception_reliability.png", PROBABILITIES, rows)
     for name, each in scores.items():
+        picture = out / f"perception_reliability_{name}.png"
+        write_reliability_by_band(picture, f"{name}, by depth and slip", by_band[name])
         write_predictions(
             out / f"perception_{name}.png",
             truth=each.contact_mm_deg,

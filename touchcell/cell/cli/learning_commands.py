@@ -263,6 +263,7 @@ def _calibrate(options: argparse.Namespace) -> int:
 
 
 def _adapt(options: argparse.Namespace) -> int:
+    from touchcell.drivers.replay.dataset import REST_IMAGE
     from touchcell.perception.calibration.adaptation import adapt
     from touchcell.perception.models.labels import CONTACT_NAMES
 
@@ -288,6 +289,8 @@ def _adapt(options: argparse.Namespace) -> int:
         print(f"warning: depth or tilt is far off the label in {len(result.doubtful)} images; check the rows of {some}")
     for region in result.missing:
         print(f"warning: no image with {region}")
+    if result.model.reference is None:
+        print(f"warning: {options.data} has no {REST_IMAGE}, an image out of contact; a cell's contact gate needs one")
     print(f"wrote {options.out}")
     return EXIT_OK
 

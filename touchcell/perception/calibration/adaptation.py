@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from touchcell.drivers.replay.dataset import read_split
+from touchcell.drivers.replay.dataset import read_rest, read_split
 from touchcell.geometry.types import Array
 from touchcell.perception.calibration.marked_data import evenly
 from touchcell.perception.calibration.transfer_fit import (
@@ -126,7 +126,7 @@ class Adapted:
 def adapt(
     model: Path, data: Path, out: Path, *, frames: int | None = None, settings: AdaptSettings | None = None
 ) -> Adapted:
-    """Write ``out``, a model for the sensor that took ``data/train``.
+    """Write ``out``, a model for the sensor that took ``data/train``, with the data set's image out of contact.
 
     Args:
         model: model file of kind markers.
@@ -163,6 +163,10 @@ def adapt(
     )
     names = [path.name for path in split.images]
     adapted = adapt_to(old, dataset, preprocessing=preprocessing, size=size, settings=settings, names=names)
+    rest = read_rest(data)
+    # A cell's contact gate compares with it.
+    reference = None if rest is None else preprocessing.reduce(rest)
+    adapted = replace(adapted, model=replace(adapted.model, reference=reference))
     save_model(adapted.model, out)
     return adapted
 

@@ -150,7 +150,7 @@ class MarkerEstimator:
         if not field.seen.any():
             return Prediction(*labels.xi_gaussian(mean, sigma), in_range=False, markers=0.0, refusal=refusal)
         in_range = not refusal and bool(np.all(np.abs(mean) <= 1.0 + RANGE_TOLERANCE))
-        calibrated = self.header.calibrated(sigma)
+        calibrated = self.header.calibrated(sigma, mean)
         # The networks' sigmas are valid only for markers that were matched, seen by the model's camera.
         xi, covariance = labels.xi_gaussian(mean, np.maximum(calibrated, 1.0) if refusal else calibrated)
         tail_scale = self.header.tail_scale

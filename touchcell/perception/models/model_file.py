@@ -24,6 +24,10 @@ from touchcell.perception.models.preprocessing import Preprocessing
 from touchcell.perception.models.transfer_spec import TransferSpec
 
 _HOW_TO_TRAIN = "train one with `touchcell train --data DIR --out NAME.safetensors`"
+_HOW_TO_ADAPT = (
+    "adapt the model of the first sensor again, with the same labelled images: "
+    "`touchcell adapt --model FIRST.safetensors --data DIR --out {out}`"
+)
 FORMAT_VERSION = 1
 _METADATA_KEY = "touchcell"
 _REFERENCE = "reference_image"
@@ -32,6 +36,8 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 Six = tuple[Finite, Finite, Finite, Finite, Finite, Finite]
 SixPositive = tuple[Positive, Positive, Positive, Positive, Positive, Positive]
+NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+SixNotNegative = tuple[NotNegative, NotNegative, NotNegative, NotNegative, NotNegative, NotNegative]
 
 
 class Labels(BaseModel):
@@ -138,6 +144,41 @@ def _ranges(low: Six, high: Six) -> tuple[Array, Array, Array]:
     return ranges
 
 
+class SessionSpread(BaseModel):
+    """What changes from one session of a sensor to the next: friction, and the zero of mount and camera.
+
+    Where the shear exceeds ``free`` of the depth, skin slips, and what is left of shear and torsion depends on
+    friction: the more, the further beyond. All are standard deviations of errors in addition to a network's own.
+
+    Attributes:
+        offset_mm_deg: (6,) of contacts; shear along and across its direction, then z, alpha, beta, gamma.
+        slip: of the shear along its direction where all of it slips, relative to the shear.
+        torsion_slip: of the torsion there, relative to the torsion.
+        free: ratio of shear to depth up to which nothing slips.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True)
+
+    offset_mm_deg: SixNotNegative
+    slip: NotNegative
+    torsion_slip: NotNegative
+    free: Positive
+
+    def variance(self, contacts: Array | None) -> Array:
+        """Return (..., 6) mm^2 and deg^2 at contacts (..., 6), mm and degrees; of the offsets alone without these."""
+        variance = np.empty((6,) if contacts is None else contacts.shape)
+        variance[...] = self.offset_mm_deg
+        variance *= variance
+        if contacts is None:
+            return variance
+        shear = np.hypot(contacts[..., 0], contacts[..., 1])
+        beyond = shear / (self.free * np.maximum(contacts[..., 2], 1e-3)) - 1.0
+        slips = np.minimum(np.maximum(beyond, 0.0), 1.0)
+        variance[..., 0] += (self.slip * slips * shear) ** 2
+        variance[..., 5] += (self.torsion_slip * slips * contacts[..., 5]) ** 2
+        return variance
+
+
 class Header(BaseModel):
     """Metadata of a model.
 
@@ -151,6 +192,7 @@ class Header(BaseModel):
             standard deviations themselves. In ``labels.sigma_unit``, along ``labels.aligned``. Found on the validation
             split.
         sigma_power: (6,) see ``sigma_scaling.calibrate``.
+        session: what is added for other sessions than the validation set's; None adds nothing.
         tail_scale: factor of the covariance that makes it the scale of a Student-t with four degrees of freedom, whose
             tails are those of the errors; None for a Gaussian.
         camera: from the pixels of this model's sensor to those of the one its networks were trained on, where it was
@@ -171,6 +213,7 @@ class Header(BaseModel):
     labels: Labels
     sigma_scale: SixPositive
     sigma_power: SixPositive = (1.0, 1.0, 1.0, 1.0, 1.0, 1.0)
+    session: SessionSpread | None = None
     tail_scale: Positive | None = None
     camera: CameraChange | None = None
     label_turn_deg: Finite = 0.0
@@ -179,10 +222,18 @@ class Header(BaseModel):
     training_data: str
     training: dict[str, str | int | float | list[float] | None] = {}
 
-    def calibrated(self, sigma: Array) -> Array:
-        """Return (..., 6) calibrated standard deviations of the network's (..., 6)."""
+    def calibrated(self, sigma: Array, mean: Array | None = None) -> Array:
+        """Return (..., 6) calibrated standard deviations of the network's (..., 6).
+
+        Args:
+            sigma: in ``labels.sigma_unit``.
+            mean: (..., 6) that belongs to it, in label half-ranges; None leaves out what slip adds in other sessions.
+        """
         calibrated: Array = np.array(self.sigma_scale) * sigma ** np.array(self.sigma_power)
-        return calibrated
+        if self.session is None or not self.labels.are_contacts:
+            return calibrated
+        more = self.session.variance(None if mean is None else self.labels.contacts(mean))
+        return np.sqrt(calibrated**2 + more / self.labels.sigma_unit**2)
 
     @model_validator(mode="after")
     def _preprocessing_feeds_network(self) -> Header:
@@ -297,7 +348,12 @@ def _parse_header(text: str | None, path: Path) -> Header:
         return Header.model_validate_json(text)
     except ValidationError as error:
         first = error.errors()[0]
-        raise ModelError(path, first["msg"], key=_key(first["type"], first["loc"]), hint="train it again") from error
+        key = _key(first["type"], first["loc"])
+        if first["loc"][:1] == ("transfer",):
+            reason = "adapted to its sensor by another version of touchcell, whose processes have other inputs"
+            hint = _HOW_TO_ADAPT.format(out=path.name)
+            raise ModelError(path, f"{reason} ({first['msg']})", key=key, hint=hint) from error
+        raise ModelError(path, first["msg"], key=key, hint="train it again") from error
 
 
 def _key(error: str, location: tuple[int | str, ...]) -> str:

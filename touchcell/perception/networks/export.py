@@ -16,7 +16,7 @@ from touchcell.perception.models.model_file import Header, Labels, Model, save_m
 from touchcell.perception.models.preprocessing import Preprocessing
 from touchcell.perception.networks.checkpoint import Progress, delete_checkpoint
 from touchcell.perception.networks.figures import write_curves, write_predictions
-from touchcell.perception.networks.sigma_scaling import calibrate, other_sessions, tail_scale
+from touchcell.perception.networks.sigma_scaling import calibration
 
 
 def write_trained(
@@ -45,10 +45,6 @@ def write_trained(
         validation_xi: (n, 6) its labels, m and rad.
     """
     targets = labels.targets(validation_xi)
-    residual, which = other_sessions(labels, mean, targets)
-    scale, power = calibrate(residual, sigma[which])
-    served = scale * sigma**power
-    distances = np.square(labels.aligned(targets - mean, mean) / served).sum(axis=1)
     best = progress.history[progress.best_epoch - 1]
     model = Model(
         Header(
@@ -56,9 +52,7 @@ def write_trained(
             architecture=architecture,
             preprocessing=preprocessing,
             labels=labels,
-            sigma_scale=tuple(scale.tolist()),
-            sigma_power=tuple(power.tolist()),
-            tail_scale=tail_scale(distances),
+            **calibration(labels, mean, sigma, targets),
             training_data=training_data,
             training={
                 **{key: list(value) if isinstance(value, tuple) else value for key, value in metadata.items()},
@@ -73,7 +67,7 @@ def write_trained(
         reference,
     )
     save_model(model, out)
-    xi, covariance = labels.xi_gaussian(mean, model.header.calibrated(sigma))
+    xi, covariance = labels.xi_gaussian(mean, model.header.calibrated(sigma, mean))
     write_predictions(
         out.with_name(f"{out.stem}_predictions.png"),
         truth=contact_from_xi(validation_xi),

@@ -161,6 +161,6 @@ class ContactModel:
         """Last step of ``predict_reduced``: convert the network's outputs to a Gaussian over xi."""
         mean = output[:6].astype(np.float64)
         sigma = np.exp(-output[6:].astype(np.float64)) if len(output) > 6 else np.ones(6)
-        xi, covariance = self.header.labels.xi_gaussian(mean, self.header.calibrated(sigma))
+        xi, covariance = self.header.labels.xi_gaussian(mean, self.header.calibrated(sigma, mean))
         in_range = bool(np.all(np.abs(mean) <= 1.0 + RANGE_TOLERANCE))
         return Prediction(xi, covariance, in_range, tail_scale=self.header.tail_scale)

@@ -35,7 +35,7 @@ class Linear:
 
     def predict_reduced(self, reduced: ImageArray) -> Prediction:
         mean = (self._weight @ (reduced.ravel() / np.float32(255)) + self._bias).astype(np.float64)
-        xi, covariance = self.header.labels.xi_gaussian(mean, self.header.calibrated(np.ones(6)))
+        xi, covariance = self.header.labels.xi_gaussian(mean, self.header.calibrated(np.ones(6), mean))
         return Prediction(xi, covariance, in_range=bool(np.all(np.abs(mean) <= 1.0)))
 
 
