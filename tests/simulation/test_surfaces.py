@@ -110,6 +110,16 @@ def test_periodic_starts_from_rest_and_draws_the_circle() -> None:
         assert np.linalg.norm(motion.pose(t_s)[:3, 3] - centre) == pytest.approx(0.075)
 
 
+def test_periodic_stands_until_its_start_and_then_moves_as_from_time_zero() -> None:
+    amplitude = np.array([0.075, 0.02, 0.01, 0.1, 0.2, 0.3])
+    at_once, later = (Periodic(pose(), amplitude, np.zeros(6), 6.0, 1.0, start_s=start_s) for start_s in (0.0, 2.5))
+    np.testing.assert_array_equal(later.pose(2.5), np.eye(4))
+    np.testing.assert_array_equal(later.twist(2.5), np.zeros(6))
+    for t_s in (0.3, 1.0, 4.0):
+        np.testing.assert_allclose(later.pose(2.5 + t_s), at_once.pose(t_s), atol=1e-15)
+        np.testing.assert_allclose(later.twist(2.5 + t_s), at_once.twist(t_s), atol=1e-15)
+
+
 def test_a_surface_moves_with_its_motion() -> None:
     plate = Surface(Plane(), Glide(pose(z=0.1), np.array([0, 0, 0.2, 0, 0, 0.0]), start_s=0.0, duration_s=1.0))
     assert plate.nearest(np.array([0.0, 0.0, 0.15]), 0.0).distance_m == pytest.approx(0.05)

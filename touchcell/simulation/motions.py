@@ -85,7 +85,8 @@ class Periodic:
         amplitude: (6,) of (x, y, z, alpha, beta, gamma), m and rad.
         shift: (6,) rad.
         period_s: period.
-        ramp_s: time until full speed.
+        ramp_s: time from its start until full speed.
+        start_s: start of the motion.
     """
 
     T_start: Array
@@ -93,6 +94,7 @@ class Periodic:
     shift: Array
     period_s: float
     ramp_s: float
+    start_s: float = 0.0
 
     def pose(self, t_s: float) -> Array:
         """Return T_world_body (4, 4)."""
@@ -112,7 +114,7 @@ class Periodic:
 
     def _phase(self, t_s: float) -> tuple[float, float]:
         full_rate = 2.0 * math.pi / self.period_s
-        t_s = max(t_s, 0.0)
+        t_s = max(t_s - self.start_s, 0.0)
         if t_s >= self.ramp_s:
             return full_rate * (t_s - 0.5 * self.ramp_s), full_rate
         u = t_s / self.ramp_s

@@ -57,6 +57,7 @@ class PeriodicConfig(Section):
         shift_deg: phase of each component.
         period_s: period of all components.
         ramp_s: time in which the amplitude grows at the start.
+        start_s: when it begins.
     """
 
     kind: Literal["periodic"]
@@ -64,6 +65,7 @@ class PeriodicConfig(Section):
     shift_deg: PoseMmDeg = (0.0, 90.0, 0.0, 0.0, 90.0, 45.0)
     period_s: float = Field(gt=0.0)
     ramp_s: float = Field(default=1.0, gt=0.0)
+    start_s: float = Field(default=0.0, ge=0.0)
 
     def build(self, T_start: Array) -> Motion:
         """Build the motion, which starts at ``T_start`` (4, 4)."""
@@ -73,6 +75,7 @@ class PeriodicConfig(Section):
             np.radians(self.shift_deg),
             self.period_s,
             self.ramp_s,
+            self.start_s,
         )
 
 
