@@ -158,9 +158,17 @@ def _print_figures(title: str, both: Mapping[str, tuple[float, float]]) -> None:
 
 def _compare_experiment(name: str, checkout: Path) -> dict[str, tuple[float, float]]:
     then, now = (_means(name, at) for at in (checkout, CHECKOUT))
-    both = {key: (before, now[key]) for key, before in then.items() if key in now}
+    names = {key: next((name for name in _names_now(key) if name in now), None) for key in then}
+    both = {name: (then[key], now[name]) for key, name in names.items() if name is not None}
     _print_figures(name, both)
     return both
+
+
+def _names_now(key: str) -> Iterator[str]:
+    """Yield what a row and measure of 0.1.0 may be called now: pushes with nothing sampled are `matched` since."""
+    yield key
+    yield key.replace(", learned: ", ", matched: ")
+    yield key.replace(", true contact: ", ", matched, true contact: ")
 
 
 def _means(experiment: str, checkout: Path) -> dict[str, float]:
