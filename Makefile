@@ -11,7 +11,7 @@ demo: .venv/core
 
 # Tests beside emulators one after another, since they have deadlines; the others on all cores.
 test: check
-	TOUCHCELL_REQUIRE_COMPILED=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto -m "not emulated and not exhaustive and not stress"
+	TOUCHCELL_REQUIRE_COMPILED=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist worksteal -m "not emulated and not exhaustive and not stress"
 	TOUCHCELL_REQUIRE_COMPILED=1 $(BIN)/python -m pytest -m "emulated and not exhaustive and not stress"
 
 fast: .venv/dev
@@ -19,7 +19,7 @@ fast: .venv/dev
 
 # What `make test` takes samples of, whole: every shipped cell, page, combination of faults, version of Python.
 exhaustive: .venv/dev
-	TOUCHCELL_REQUIRE_COMPILED=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto -m "exhaustive and not emulated"
+	TOUCHCELL_REQUIRE_COMPILED=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist worksteal -m "exhaustive and not emulated"
 	TOUCHCELL_REQUIRE_COMPILED=1 $(BIN)/python -m pytest -m "exhaustive and emulated"
 
 # Half an hour; `make stress STEPS=100000` takes a few minutes.

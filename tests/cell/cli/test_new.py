@@ -137,6 +137,7 @@ def fill_in(source: Path, filled: dict[str, str]) -> None:
     )
 
 
+@pytest.mark.timeout(600)
 @pytest.mark.parametrize("kind", sorted(REGISTRIES))
 def test_a_new_package_is_red_until_it_is_filled_in(
     kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
