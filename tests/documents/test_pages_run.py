@@ -75,7 +75,12 @@ def _follow(block: Block, folder: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-@pytest.mark.parametrize("page", FOLLOWED, ids=_names)
+@pytest.mark.parametrize(
+    "page",
+    # A dozen whole runs; tests/cell/sweeps has shorter ones of each kind.
+    [pytest.param(page, marks=[pytest.mark.exhaustive] * (page.name == "sweep.md")) for page in FOLLOWED],
+    ids=_names,
+)
 def test_a_page_followed_literally_does_what_it_says(page: Path, tmp_path: Path) -> None:
     followed = list(blocks(page))
     assert followed
