@@ -1,6 +1,6 @@
 """``python -m benchmarks pushes``: whether a push that says done has brought its object to the target.
 
-    python -m benchmarks --out bench pushes [--rigs 60] [--seeds 2 24 29] [--map]
+    python -m benchmarks --out bench pushes [--rigs 60] [--seeds 2 24 29] [--before FILE] [--map]
 
 Each rig is one of the experiments' prisms on one of their tables, pushed by one arm or by two, with truth sampled apart
 from what is told: start to 20 mm and 20 deg off, mass to 50 % and friction to 30 % off, the centre of mass to 10 mm
@@ -8,7 +8,8 @@ beside the middle in every second rig, another tip than the network's, mount, la
 push that says done and whose object is farther from its target than the task's tolerance. The maps (``--map``, with
 ``--rigs 0`` alone) show the object's error over start offset and angle with one arm and with two, over friction and
 mass, and over speed and target, with the shipped network on another tip than it knows, quasi-static. An interrupted
-call goes on where it stopped.
+call goes on where it stopped. ``pushes_time.txt`` says in which states of the task the time passes, and with the
+``pushes.json`` of an earlier call (``--before``) how the same rigs ended then.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from touchcell.cell.analysis.run_folder import RunFolder
 from touchcell.cell.bench.provenance import provenance
 from touchcell.cell.experiments.push_measures import OBJECT
 from touchcell.cell.experiments.pushing import (
@@ -170,17 +172,61 @@ def run(arguments: Sequence[str], out: Path) -> None:
     parser = argparse.ArgumentParser(prog="pushes", description=__doc__.partition("\n")[0])
     parser.add_argument("--rigs", type=int, default=60)
     parser.add_argument("--seeds", type=int, nargs="*", help="these rigs in place of the first")
+    parser.add_argument("--before", type=Path, help="pushes.json of an earlier call, to compare with")
     parser.add_argument("--map", action="store_true", help="draw the maps, too")
     options = parser.parse_args(arguments)
-    perform = Perform(push_measures, out / "pushes")
+    perform = Perform(measures, out / "pushes")
     rigs = [rig(seed) for seed in options.seeds or range(options.rigs)]
+    before = {} if options.before is None else json.loads(options.before.read_text())
     if rigs:
-        _rigs(perform, rigs, out)
+        ended = _rigs(perform, rigs, out)
+        lines = time_table(rigs, ended, {each["seed"]: each for each in before.get("rigs", ())})
+        print("\n".join(lines))
+        text = [f"{key}: {value}" for key, value in provenance().items()]
+        if before:
+            text.append(f"before: {before['provenance']['commit']}")
+        (out / "pushes_time.txt").write_text("\n".join([*text, "", *lines]) + "\n")
     if options.map:
         _draw_maps(perform, out)
 
 
-def _rigs(perform: Perform, rigs: Sequence[Rig], out: Path) -> None:
+def measures(run: RunFolder) -> dict[str, float]:
+    """Return the measures of the experiments, and how long the task was in each of its states."""
+    found = push_measures(run)
+    task = run.recording.series("/task")
+    if task is None:
+        return found
+    for row, lasted_s in zip(task.rows, np.diff(task.t_s, append=task.t_s[-1:]), strict=True):
+        name = f"state_{row.get('state')}_s"
+        found[name] = found.get(name, 0.0) + float(lasted_s)
+    return found
+
+
+_TIMED: Final = ("prepare", "approach", "check", "settle", "sidestep", "run", "retract")
+
+
+def time_table(
+    rigs: Sequence[Rig], ended: Mapping[int, Finished], before: Mapping[int, Mapping[str, Any]]
+) -> list[str]:
+    """Return how long each rig was in each state, and its end beside an earlier one."""
+    titles = "".join(f"{name:>10}" for name in _TIMED)
+    lines = [f"{'seconds in each state':<48}{titles}{'touch to end':>14}{'object mm':>11}"]
+    lines[0] += f"{'before: s':>11}{'mm':>7}" * bool(before)
+    for each in rigs:
+        found, verdict_now = ended[each.seed].measures, verdict(ended[each.seed])
+        spent = "".join(f"{found.get(f'state_{name}_s', 0.0):>10.1f}" for name in _TIMED)
+        lines.append(f"{each.seed:>3} {each.pushed.name:<13}{each.group:<31}{spent}{_ended(verdict_now, found)}")
+        if then := before.get(each.seed):
+            lines[-1] += f"{_ended(then['verdict'], then, seconds=11, mm=8)}"
+    return lines
+
+
+def _ended(verdict_then: str, found: Mapping[str, float], *, seconds: int = 14, mm: int = 11) -> str:
+    took_s, off_mm = found.get("push_s", np.nan), found.get("object_error_mm", np.nan)
+    return f"{took_s:>{seconds}.1f}{off_mm:>{mm}.2f}" if verdict_then == "done" else f"{verdict_then:>{seconds + mm}}"
+
+
+def _rigs(perform: Perform, rigs: Sequence[Rig], out: Path) -> dict[int, Finished]:
     ended: dict[int, Finished] = {}
     for each in rigs:
         ended[each.seed] = _performed(perform, each.trial)
@@ -202,6 +248,7 @@ def _rigs(perform: Perform, rigs: Sequence[Rig], out: Path) -> None:
         for each in rigs
     ]
     (out / "pushes.json").write_text(json.dumps({"provenance": provenance(), "rigs": rows}, indent=1) + "\n")
+    return ended
 
 
 def _performed(perform: Perform, trial: Trial) -> Finished:

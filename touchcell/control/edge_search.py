@@ -21,8 +21,8 @@ _STEP_M: Final = 0.011
 centre."""
 _EDGE_RAD: Final = math.radians(4.0)
 """Turn of the normal from which an edge is touched, and not the side."""
-_INWARDS_RAD: Final = math.radians(20.0)
-"""Turn of the tip towards the edge's normals: models know tilts to 25 degrees."""
+_INWARDS_RAD: Final = math.radians(14.0)
+"""Turn of the tip towards the edge's normals: models know tilts to 25 degrees, and turning takes time."""
 _APART_M: Final = 0.005
 """Distance of two contacts from which the line through them tells how their side is turned."""
 _MOST_TOUCHES: Final = 8
@@ -67,6 +67,11 @@ class EdgeSearch:
         dx, dy = left._edge.x - right._edge.x, left._edge.y - right._edge.y
         x, y = 0.5 * (left._edge.x + right._edge.x), 0.5 * (left._edge.y + right._edge.y)
         return Contact(x, y, math.atan2(dy, dx) - 0.5 * math.pi), math.hypot(dx, dy)
+
+    @property
+    def left(self) -> float:
+        """1 for the left edge, -1 for the right one."""
+        return self._left
 
     @property
     def failed(self) -> bool:

@@ -49,6 +49,12 @@ _BUILDING_M: Final = 0.003
 """Travel over which a new contact's shear builds up, which is no motion of the object."""
 
 
+_OPPOSITE_RAD: Final = math.radians(30.0)
+"""Angle between a normal and the line to another contact up to which they are on opposite sides ..."""
+_PARALLEL_RAD: Final = math.radians(4.0)
+"""... and between two sides that are as good as parallel: models misread normals by a degree."""
+
+
 @dataclass(frozen=True, slots=True)
 class Contact:
     """Contact of a pushing tip, in top view.
@@ -124,6 +130,24 @@ class Motion:
     contact_left_m_s: float
 
 
+def half_between(one: Contact, other: Contact) -> float | None:
+    """Return the distance from a contact to the middle between it and one on the far side of an object.
+
+    Exact for a straight side with a parallel one behind it, and for a circle. None where the normals do not tell.
+    """
+    dx, dy = other.x_m - one.x_m, other.y_m - one.y_m
+    apart_m, chord = math.hypot(dx, dy), math.atan2(dy, dx)
+    beside = math.remainder(chord - one.heading_rad, 2.0 * math.pi)
+    beyond = math.remainder(chord - other.heading_rad - math.pi, 2.0 * math.pi)
+    if max(abs(beside), abs(beyond)) > _OPPOSITE_RAD:
+        return None
+    if abs(math.remainder(beside - beyond, 2.0 * math.pi)) < _PARALLEL_RAD:
+        return 0.5 * apart_m * math.cos(0.5 * (beside + beyond))
+    if abs(beside + beyond) < _PARALLEL_RAD:
+        return 0.5 * apart_m / math.cos(0.5 * (beside - beyond))
+    return None
+
+
 class PushEstimator:
     """Estimates where a pushed object's centre of friction and middle are, and its lever: a Kalman filter.
 
@@ -150,6 +174,14 @@ class PushEstimator:
         # Of each contact so far: travel, way to the left in the object's frame, heading.
         self._past: deque[tuple[float, float, float]] = deque()
         self.move_contact(0.0, _OFFSET_PRIOR_M if flat else 0.0)
+
+    def change_reach(self, reach_m: float) -> None:
+        """Take the centre to be at another distance along the normal; the lever is that of a larger object, then."""
+        scale = (reach_m / self._reach_m) ** 2
+        self._reach_m = reach_m
+        self._mean[1] *= scale
+        self._covariance[1, :] *= scale
+        self._covariance[:, 1] *= scale
 
     def move_contact(self, middle_m: float, sigma_m: float, *, keep_eccentricity: bool = False) -> None:
         """Begin again with another contact of the same object.

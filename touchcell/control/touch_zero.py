@@ -10,6 +10,7 @@ the object gives way, which shows how the error grows.
 from __future__ import annotations
 
 from collections import deque
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -21,6 +22,8 @@ _FIRST_CHANGE: Final = 0.012
 _LAST_CHANGE: Final = 0.2
 """... and to which: the change of deeper contacts is no straight line."""
 _FEWEST: Final = 3
+_STRAIGHT: Final = 0.6
+"""Share of the steepest growth of the change from which the object still rests."""
 _AT_REST_M_S: Final = 0.5e-3
 _NOW: Final = 4
 """Last poses that tell whether the sensor still moves ..."""
@@ -101,6 +104,16 @@ class TouchZero:
         if abs(error_m) < _LARGEST_M:
             self.error_m = error_m
 
+    def _while_resting(self) -> list[tuple[float, float]]:
+        """Return the advances and changes up to which the change kept growing: then a light object gives way."""
+        steepest = 0.0
+        for count, (one, other) in enumerate(pairwise(self._moving), 1):
+            slope = (other[1] - one[1]) / max(other[0] - one[0], 1e-6)
+            if slope < _STRAIGHT * steepest:
+                return self._moving[:count]
+            steepest = max(steepest, slope)
+        return self._moving
+
     def _speed_m_s(self, since: int) -> float:
         """Return the mean speed since one of the poses that were noted."""
         (then_ns, then), (now_ns, now) = self._poses[max(since, -len(self._poses))], self._poses[-1]
@@ -114,7 +127,7 @@ class TouchZero:
         return float(np.interp(0.0, times, along))
 
     def _conclude(self, advance_m: float, change: float, T_s_f: Array) -> None:
-        advances, changes = np.array(self._moving).T
+        advances, changes = np.array(self._while_resting()).T
         spread = advances - advances.mean()
         if float(spread @ spread) < 1e-9:
             return

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Protocol, runtime_checkable
 
 import numpy as np
@@ -115,6 +115,16 @@ class Easing(Protocol):
 
 
 @runtime_checkable
+class Assuming(Protocol):
+    """Behavior whose success is true only as far as something holds that it has no means to measure."""
+
+    @property
+    def rests_on(self) -> Sequence[str]:
+        """What that is, each in a phrase that continues "done, as far as"."""
+        ...
+
+
+@runtime_checkable
 class DepthAware(Protocol):
     """Behavior that needs the depth of its contact better than a model reads it."""
 
@@ -192,6 +202,11 @@ def _rotation(R: Array) -> Array:
     T = np.eye(4)
     T[:3, :3] = R
     return T
+
+
+def _is_at(goal: Goal, distance_m: float, angle_rad: float) -> bool:
+    reached_m, reached_rad = (_PASSED_M, _PASSED_RAD) if goal.passes else (_REACHED_M, _BACK_RAD)
+    return distance_m < reached_m and angle_rad < reached_rad
 
 
 def _six(linear_mm: float, angular_deg: float) -> Array:
@@ -429,7 +444,7 @@ class ContactServo:
 
         Args:
             speed_m_s: in free air.
-            feeling_m_s: where the goal is to feel for a contact.
+            feeling_m_s: where the goal is to feel for a contact, at most.
         """
         assert self.T_base_sensor is not None
         assert self._goal is not None
@@ -444,15 +459,26 @@ class ContactServo:
             self._felt_s += self._period_s
             if self._felt_s >= _FEEL_S:
                 self._next_goal(self.T_s_f)
-        elif distance_m < _REACHED_M and angle_rad < _BACK_RAD:
+        elif self._goal.feels and self.change_since_zero > _FELT_CHANGE and self._felt_s < _FEEL_S:
+            # A touch is as light as it can be: what is pressed moves.
+            self._felt_s += self._period_s
+        elif _is_at(self._goal, distance_m, angle_rad):
             self._next_goal(None)
         else:
-            # The last stretch is slower, so that it ends there.
-            fastest = feeling_m_s if self._goal.feels else min(speed_m_s, _APPROACH_PER_S * distance_m)
+            fastest = self._free_speed_m_s(self._goal, distance_m, speed_m_s, feeling_m_s)
             V_s[:3] = R.T @ way * (fastest / max(distance_m, 1e-9))
             rate = math.radians(self._config.max_turn_deg_s)
             V_s[3:] = turn * (min(rate, _APPROACH_PER_S * angle_rad) / max(angle_rad, 1e-9))
         return self._accelerated(self._Ad_tcp_sensor @ V_s)
+
+    def _free_speed_m_s(self, goal: Goal, distance_m: float, speed_m_s: float, feeling_m_s: float) -> float:
+        """Return the speed at a distance from a goal: as fast as it can still slow down."""
+        accel_m_s2 = _BRAKING * 1e-3 * self._config.max_accel_mm_s2
+        if not goal.feels:
+            return min(speed_m_s, _APPROACH_PER_S * distance_m, math.sqrt(2.0 * accel_m_s2 * distance_m))
+        feeling_m_s *= _LIGHTLY
+        free_m = max(distance_m - goal.slow_m, 0.0)
+        return min(max(_FREE_M_S, feeling_m_s), math.sqrt(feeling_m_s**2 + 2.0 * accel_m_s2 * free_m))
 
     def _next_goal(self, T_s_f: Array | None) -> None:
         assert self.T_base_sensor is not None
@@ -537,8 +563,15 @@ _LONGEST_UNCHANGED_MM = 2.5
 # The image changes by about 0.1 per millimetre of depth (``contact_gate``).
 _LEAST_CHANGE = 0.01
 _REACHED_M = 0.5e-3
+_PASSED_M, _PASSED_RAD = 2.5e-3, math.radians(4.0)
 _FEEL_S = 0.15
-_APPROACH_PER_S = 8.0
+_FELT_CHANGE = 0.02
+_LIGHTLY = 0.6
+_APPROACH_PER_S = 12.0
+# Share of the largest acceleration that slows a motion down: arms lag behind what they are told.
+_BRAKING = 0.8
+# Speed towards what is not expected to be touched yet: a side that is nearer is not pushed far before it shows.
+_FREE_M_S = 0.03
 
 
 _COMPONENTS = ("x_mm", "y_mm", "z_mm", "alpha_deg", "beta_deg", "gamma_deg")

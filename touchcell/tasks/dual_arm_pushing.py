@@ -92,11 +92,13 @@ class Follow:
         self._active = config.follower.active
         self._T_leader_follower = T_leader_follower
         self._speed_m_s = 1e-3 * config.push_speed_mm_s
-        self._middle_m = 1e-3 * config.object_center_offset_mm
+        self._told_middle_m = 1e-3 * config.object_center_offset_mm
+        self._tip_radius_m = 1e-3 * config.tip_radius_mm
         self._ease_from_m = 1e-3 * config.follower.ease_from_mm
         self._most_ease_m = max(0.0, 1e-3 * (config.follower.reference_mm_deg[2] - config.follower.ease_to_mm))
         self._turn_per_m = 1e3 * np.radians(config.follower.turn_deg_per_mm)
         self._T_base_sensor: Array | None = None
+        self._far: Pose | None = None
         self._y_is_left = 1.0
         self._steps: Iterator[Goal] = iter(())
 
@@ -125,6 +127,11 @@ class Follow:
         return twist_in_sensor(cos * vx + sin * vy, cos * vy - sin * vx, turn, self._y_is_left)
 
     @property
+    def _middle_m(self) -> float:
+        push = self._push.predictive
+        return self._told_middle_m if push is None else push.lead_m
+
+    @property
     def ease_m(self) -> float:
         """Depth by which it presses less, because the leader is near the depth that its tip bears."""
         if not self._active:
@@ -140,6 +147,11 @@ class Follow:
         """Return True only at a limit: the leader decides when the object has arrived."""
         self._y_is_left = -float(np.sign(now[2, 0]))
         self._T_base_sensor = now
+        push = self._push.predictive
+        if push is not None and T_s_f is not None:
+            far = push.touched(self._T_leader_follower @ now, T_s_f)
+            self._far = Pose(far.x_m, far.y_m, far.heading_rad)
+            push.touched_beyond(far)
         self._at_limit = self._bounds.reached(dt_s, before, now, T_s_f)
         return bool(self._at_limit)
 
@@ -172,12 +184,16 @@ class Follow:
     def _step_opposite(self, T_base_sensor: Array) -> Iterator[Goal]:
         away = T_base_sensor.copy()
         away[:3, 3] -= _CLEAR_M * T_base_sensor[:3, 2]
-        yield Goal(away)
+        yield Goal(away, passes=True)
         push = self._push.predictive
         assert push is not None
         while (middle := push.located) is None:
-            yield Goal(away)
-        at = middle.ahead(self._middle_m + _CLEAR_M)
+            yield Goal(away, passes=True)
+        far_m = self._middle_m
+        if self._far is not None:
+            # Where it is longer than was told, there is no room for the way to the far side as it was told.
+            far_m = max(far_m, middle.local((self._far.x, self._far.y))[0] + self._tip_radius_m)
+        at = middle.ahead(far_m + _CLEAR_M)
         T_follower_leader = se3.inverse(self._T_leader_follower)
         T = placed(self._T_leader_follower @ away, Pose(at.x, at.y, at.heading + math.pi))
         yield Goal(T_follower_leader @ T)

@@ -17,11 +17,16 @@ class Goal:
 
     Attributes:
         T_base_sensor: (4, 4) its pose there.
-        feels: True if it goes slowly, and no farther than to a contact.
+        feels: True if it goes no farther than to a contact.
+        slow_m: last part of a way that feels, on which it goes slowly: nothing is expected before. All of it by
+            default.
+        passes: True if it only passes by there, on its way to the next one.
     """
 
     T_base_sensor: Array
     feels: bool = False
+    slow_m: float = math.inf
+    passes: bool = False
 
 
 def heading_of(direction: Array) -> float:

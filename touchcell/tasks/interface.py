@@ -7,9 +7,9 @@ supervisor, and sends what it allows. So every task is tested with plain data an
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final, Generic, Literal, Protocol, TypeAlias, TypeVar
+from typing import Any, Final, Generic, Literal, Protocol, TypeAlias, TypeVar, runtime_checkable
 
 from pydantic import BaseModel, ConfigDict
 
@@ -136,6 +136,16 @@ class Task(Protocol):
 
     def trip(self, now_ns: int, reason: str) -> None:
         """Enter the tripped state, from which nothing moves, because the supervisor has latched."""
+        ...
+
+
+@runtime_checkable
+class Conditional(Protocol):
+    """Task whose success is true only as far as something holds that it has no means to measure."""
+
+    @property
+    def rests_on(self) -> Sequence[str]:
+        """What that is, each in a phrase that continues "done, as far as"."""
         ...
 
 

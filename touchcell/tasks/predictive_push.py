@@ -12,7 +12,7 @@ import numpy as np
 
 from touchcell.control.edge_search import EdgeSearch
 from touchcell.control.path import Path, Point
-from touchcell.control.push_model import Contact, Motion, PushEstimator
+from touchcell.control.push_model import Contact, Motion, PushEstimator, half_between
 from touchcell.control.push_steering import Plan, Pose, steer
 from touchcell.geometry.types import Array
 from touchcell.tasks.free_motion import Goal, heading_of, placed
@@ -43,6 +43,8 @@ _CLEAR_M: Final = 0.008
 """Distance by which a sensor lets go of an object before it steps aside."""
 _NEAR_M: Final = 0.004
 """The same beside a side whose edges have been felt."""
+_SLOW_M: Final = 0.0015
+"""Distance before a side from which it is approached slowly: what touches tell of it is wrong by less."""
 _EDGE_SIGMA_M: Final = 1.5e-3
 """Uncertainty of a side's middle by the touch of one edge and a width that nothing has shown to be right ..."""
 _EDGES_SIGMA_M: Final = 0.3e-3
@@ -53,6 +55,9 @@ _ECCENTRIC_M: Final = 0.006
 """Standard deviation of the centre of friction from the middle."""
 _FOLLOWED_M: Final = 0.010
 """What a follower's force adds to it."""
+_REACH_M: Final = 0.002
+"""Difference between that distance as it was told and as two arms measure it beyond which it was told wrong: depths are
+misread by up to 0.6 mm at each arm."""
 _REACH_SIGMA_M: Final = 0.3e-3
 """Uncertainty of the middle along the contact normal."""
 _SIDE_SIGMA_RAD: Final = math.radians(2.5)
@@ -183,6 +188,8 @@ class PredictivePush:
         self._side_heading: float | None = None
         self._heading_error = 0.0
         self._loaded_m = 0.0
+        self.reach_felt_m: float | None = None
+        """Half of the object along the contact normal, by the contacts of two arms; None while nothing tells."""
         self.depth_error_m = 0.0
         """What a model reads too much of the contact's depth."""
         self.motion = _STANDING
@@ -231,6 +238,22 @@ class PredictivePush:
         dx, dy = point[0] - contact.x_m, point[1] - contact.y_m
         ahead, left, turn = motion.contact_ahead_m_s, motion.contact_left_m_s, motion.turn_rad_s
         return cos * ahead - sin * left - turn * dy, sin * ahead + cos * left + turn * dx, turn
+
+    @property
+    def lead_m(self) -> float:
+        """From the centre of the tip to the object's centre, where the tip just touches."""
+        return self._settings.lead_m
+
+    def touched_beyond(self, far: Contact) -> None:
+        """Take a follower's contact with the far side into account, while the object rests between both."""
+        if self._moves or self._must_place or self._contact is None or self._resting is not None:
+            return
+        near, reach_m = self._contact, self._estimator.model.reach_m
+        self.reach_felt_m = half_between(near, far)
+        if self.reach_felt_m is not None and abs(self.reach_felt_m - reach_m) > _REACH_M:
+            self._settings = replace(self._settings, lead_m=self._settings.tip_radius_m + self.reach_felt_m)
+            self._estimator.change_reach(self.reach_felt_m)
+            self._path, self._along_m = None, 0.0
 
     @property
     def must_place(self) -> bool:
@@ -286,7 +309,7 @@ class PredictivePush:
             T_base_sensor: (4, 4) pose of the sensor at the last goal.
             T_s_f: (4, 4) contact made on the way there; None if there was none.
         """
-        self._felt = None if T_s_f is None else self._touched(T_base_sensor, T_s_f)
+        self._felt = None if T_s_f is None else self.touched(T_base_sensor, T_s_f)
         return next(self._steps, None)
 
     def _step_to(self, T_base_sensor: Array, left_m: float) -> Iterator[Goal]:
@@ -296,24 +319,24 @@ class PredictivePush:
         contact, heading = self._contact, self._contact.heading_rad
         self._resting = self._middle, self._estimator.middle_sigma_m
         self.located = self._middle
-        yield Goal(placed(T_base_sensor, _tip_behind(T_base_sensor, heading, _CLEAR_M)))
+        yield Goal(placed(T_base_sensor, _tip_behind(T_base_sensor, heading, _CLEAR_M)), passes=True)
         at = Pose(contact.x_m, contact.y_m, heading).ahead(left_m, 0.5 * math.pi)
         yield Goal(placed(T_base_sensor, at.ahead(-self._settings.tip_radius_m - _CLEAR_M)))
 
     def _feel_edge(self, T_base_sensor: Array, side: Contact) -> Iterator[Goal]:
         """Search for the edges of the side, and then be opposite its middle."""
-        settings, model = self._settings, self._estimator.model
         self._searches += 1
-        yield Goal(placed(T_base_sensor, _tip_behind(T_base_sensor, side.heading_rad, _CLEAR_M)))
+        yield Goal(placed(T_base_sensor, _tip_behind(T_base_sensor, side.heading_rad, _CLEAR_M)), passes=True)
         found, sigma_m = yield from self._middle_of(T_base_sensor, side)
         at = _pose_of(found)
         self._side_is_felt = sigma_m <= _EDGES_SIGMA_M
-        middle = at.ahead(model.reach_m)
+        middle = at.ahead(self._estimator.model.reach_m)
         self._resting, self.located = (middle, sigma_m), middle
-        yield Goal(placed(T_base_sensor, at.ahead(-settings.tip_radius_m - _CLEAR_M)))
+        clear_m = _NEAR_M if self._side_is_felt else _CLEAR_M
+        yield Goal(placed(T_base_sensor, at.ahead(-self._settings.tip_radius_m - clear_m)))
 
     def _middle_of(self, T_base_sensor: Array, side: Contact) -> Generator[Goal, None, tuple[Contact, float]]:
-        """Feel both edges of a side; return its middle and the standard deviation of that."""
+        """Feel both edges of a side, and the side between them; return its middle with its standard deviation."""
         settings = self._settings
         expected_m = self._estimator.model.middle_m or 0.0
         at = _pose_of(side).ahead(expected_m, 0.5 * math.pi)
@@ -322,42 +345,52 @@ class PredictivePush:
         width_m = told or 2.0 * (settings.lead_m - settings.tip_radius_m)
         for is_told in (told is not None, True):
             one = EdgeSearch(side, expected_m, width_m, settings.tip_radius_m)
-            yield from self._feel(T_base_sensor, one)
+            yield from self._feel(T_base_sensor, one, _CLEAR_M)
             if one.middle is None:
                 break
             other = one.opposite()
-            yield from self._feel(T_base_sensor, other)
+            yield from self._feel(T_base_sensor, other, _NEAR_M)
             if other.middle is None:
                 found, sigma_m = one.middle, _EDGE_SIGMA_M if is_told else sigma_m
                 break
             found, felt_m = one.between(other)
             sigma_m = max(_EDGES_SIGMA_M, 0.5 * abs(felt_m - width_m))
             if not is_told or sigma_m < 0.5 * _WIDTH_M:
-                found = yield from self._straightened(T_base_sensor, found, 0.5 * felt_m)
-                return found, _EDGES_SIGMA_M
+                touches = yield from self._touch_twice(T_base_sensor, found, 0.5 * felt_m, other.left)
+                return self._straightened(found, touches), _EDGES_SIGMA_M
             # Either the width is not what was told, or something else was taken for an edge.
             side, expected_m, width_m = found, 0.0, felt_m
         return found, sigma_m
 
-    def _straightened(self, T_base_sensor: Array, middle: Contact, half_m: float) -> Generator[Goal, None, Contact]:
-        """Touch a side on both sides of its middle, and return this as the arm's positions there say that it lies.
+    def _touch_twice(
+        self, T_base_sensor: Array, middle: Contact, half_m: float, left: float
+    ) -> Generator[Goal, None, list[Contact]]:
+        """Touch a side on both sides of its middle, the left one first where ``left`` is 1; return what was touched.
+
+        After its edges: each touch turns a light object a little, about a point near where the other one is.
+        """
+        at = _pose_of(middle)
+        apart_m = min(half_m - _FROM_EDGE_M, _FARTHEST_APART_M)
+        touches: list[Contact] = []
+        if apart_m < _LEAST_APART_M:
+            return touches
+        for left_m in (left * apart_m, -left * apart_m):
+            clear = at.ahead(-self._settings.tip_radius_m - _NEAR_M).ahead(left_m, 0.5 * math.pi)
+            yield Goal(placed(T_base_sensor, clear), passes=True)
+            yield Goal(placed(T_base_sensor, clear.ahead(2.0 * _NEAR_M)), feels=True, slow_m=_NEAR_M + _SLOW_M)
+            if self._felt is not None:
+                touches.append(self._felt)
+            yield Goal(placed(T_base_sensor, clear), passes=True)
+        return touches
+
+    def _straightened(self, middle: Contact, touches: Sequence[Contact]) -> Contact:
+        """Return the middle of a side as the arm's positions at two touches of it say that it lies.
 
         Both touches are misread by the same: their normals do not count, nor does what that shifts the edges.
         """
-        settings, at = self._settings, _pose_of(middle)
-        apart_m = min(half_m - _FROM_EDGE_M, _FARTHEST_APART_M)
-        if apart_m < _LEAST_APART_M:
+        if len(touches) < 2:
             return middle
-        felt = []
-        for left_m in (apart_m, -apart_m):
-            clear = at.ahead(-settings.tip_radius_m - _NEAR_M).ahead(left_m, 0.5 * math.pi)
-            yield Goal(placed(T_base_sensor, clear))
-            yield Goal(placed(T_base_sensor, clear.ahead(2.0 * _NEAR_M)), feels=True)
-            felt.append(self._felt)
-            yield Goal(placed(T_base_sensor, clear))
-        left, right = felt
-        if left is None or right is None:
-            return middle
+        right, left = sorted(touches, key=lambda each: _pose_of(middle).local((each.x_m, each.y_m))[1])
         turned = math.remainder(left.heading_rad - right.heading_rad, 2.0 * math.pi)
         if abs(turned) > _FLAT_RAD:
             return middle
@@ -368,24 +401,24 @@ class PredictivePush:
         # What is misread of the tilt moves the point at which a round tip seems to touch.
         x, y = 0.5 * (left.x_m + right.x_m), 0.5 * (left.y_m + right.y_m)
         line = Pose(x, y, heading)
-        aside_m = line.local((middle.x_m, middle.y_m))[1] - settings.tip_radius_m * misread
+        aside_m = line.local((middle.x_m, middle.y_m))[1] - self._settings.tip_radius_m * misread
         found = line.ahead(aside_m, 0.5 * math.pi)
         return Contact(found.x, found.y, heading)
 
-    def _feel(self, T_base_sensor: Array, search: EdgeSearch) -> Iterator[Goal]:
+    def _feel(self, T_base_sensor: Array, search: EdgeSearch, clear_m: float) -> Iterator[Goal]:
         """Touch until the search has found its edge or failed."""
         while search.middle is None and not search.failed:
-            clear = search.tip(_CLEAR_M)
-            yield Goal(placed(T_base_sensor, clear))
-            beyond = clear.ahead(2.0 * _CLEAR_M, search.direction_rad - clear.heading)
-            yield Goal(placed(T_base_sensor, beyond), feels=True)
+            clear = search.tip(clear_m)
+            yield Goal(placed(T_base_sensor, clear), passes=True)
+            beyond = clear.ahead(clear_m + _CLEAR_M, search.direction_rad - clear.heading)
+            yield Goal(placed(T_base_sensor, beyond), feels=True, slow_m=_CLEAR_M + _SLOW_M)
             if self._felt is None:
                 search.missed()
             else:
                 search.touched(self._felt)
-            yield Goal(placed(T_base_sensor, clear))
+            yield Goal(placed(T_base_sensor, clear), passes=True)
 
-    def _touched(self, T_base_sensor: Array, T_s_f: Array) -> Contact:
+    def touched(self, T_base_sensor: Array, T_s_f: Array) -> Contact:
         """Return the point of the object nearest to the tip's centre, whatever shear there is."""
         depth_m = max(0.0, -float(T_s_f[:3, 2] @ T_s_f[:3, 3]))
         normal = T_base_sensor[:3, :3] @ T_s_f[:3, 2]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from enum import Enum, auto
 from typing import Annotated, Final, TypeVar
 
@@ -14,7 +14,7 @@ from touchcell.drivers.core.commands import TwistCommand, TwistFrame
 from touchcell.drivers.core.protocols import SERVO_ARM
 from touchcell.errors import TouchcellError
 from touchcell.geometry.types import Array
-from touchcell.tasks.contact_servo import Behavior, ContactServo, ContactServoConfig, Six
+from touchcell.tasks.contact_servo import Assuming, Behavior, ContactServo, ContactServoConfig, Six
 from touchcell.tasks.interface import (
     DEPTH,
     DISTANCE,
@@ -265,6 +265,12 @@ class ServoTask(MachineTask):
         return Action(
             {servo.arm: self._command(servo, V) for servo, V in twists}, self._telemetry(observation), zero=zero
         )
+
+    @property
+    def rests_on(self) -> Sequence[str]:
+        """What success rests on that nothing has measured."""
+        runs = [servo.run for servo in self._servos]
+        return [each for run in runs if isinstance(run, Assuming) for each in run.rests_on]
 
     def must_check(self) -> bool:
         """Guard: a sensor's contact is estimated by a model, and the sensors have not been checked yet."""

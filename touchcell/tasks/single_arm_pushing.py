@@ -223,6 +223,27 @@ class Push:
         return self._predictive is not None and self._predictive.wants_sidestep
 
     @property
+    def rests_on(self) -> Sequence[str]:
+        """Where the object's centre is behind the side that is pushed, unless two arms have measured it."""
+        told_mm, push = 1e3 * self._lead_m, self._predictive
+        if push is None:
+            return (
+                "the object's centre is straight ahead of the contact, and "
+                f"object_center_offset_mm is right ({told_mm:g} mm were told): neither was measured",
+            )
+        if push.reach_felt_m is None:
+            return (
+                f"object_center_offset_mm is right ({told_mm:g} mm were told): nothing that was touched tells it, and "
+                "what it is wrong by the object is off",
+            )
+        if push.lead_m != self._lead_m:
+            return (
+                "the object's centre is midway between the sides that both arms touch, "
+                f"{1e3 * push.lead_m:.1f} mm ahead, where object_center_offset_mm says {told_mm:g}",
+            )
+        return ()
+
+    @property
     def only_touches(self) -> bool:
         """True until the object is touched where it will be pushed: that contact will be given up."""
         return self._predictive is not None and self._predictive.must_place

@@ -217,6 +217,7 @@ def _headline(source: RunFolder, plan: CellPlan | None) -> list[str]:
         lines = [f"{result['cell']}: {result['task']} {result['outcome']} after {float(result['duration_s']):.2f} s"]
         if result.get("reason"):
             lines.append(f"  {result['reason']}")
+        lines += [f"  as far as {each}" for each in result.get("rests_on", ())]
     else:
         name = source.path.resolve().name if plan is None else f"{plan.cell.name}: {plan.task.name}"
         lines = [f"{name} has no result after {recorded_s:.2f} s: " + _without_result(source.path)]

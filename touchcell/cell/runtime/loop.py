@@ -38,7 +38,7 @@ from touchcell.drivers.core.errors import ConnectError, DeviceError, DeviceGone
 from touchcell.drivers.core.lease import Lease
 from touchcell.drivers.core.protocols import ServoArm, SettingSink, TwistSink
 from touchcell.errors import TouchcellError
-from touchcell.tasks.interface import Action, Observation, Task, TransitionRecord
+from touchcell.tasks.interface import Action, Conditional, Observation, Task, TransitionRecord
 from touchcell.tasks.state_machine import FAULT, STOP, TRIP, TaskMachine, state_name
 
 logger = logging.getLogger(__name__)
@@ -386,6 +386,7 @@ class RunLoop:
             cell.supervisor.latch.causes,
             self._reports,
             () if self._reset is None else tuple(self._reset.resets),
+            rests_on=self._rests_on(cell.task) if outcome is Outcome.DONE else (),
             lost=outcome in (Outcome.TRIPPED, Outcome.ERROR) and (self._lost or cell.watchdog.lost),
         )
 
@@ -396,6 +397,14 @@ class RunLoop:
             return outcome, _reason(task.transitions, outcome)
         except Exception as error:
             return Outcome.ERROR, str(UnexpectedError(error))
+
+    def _rests_on(self, task: Task) -> tuple[str, ...]:
+        if not isinstance(task, Conditional):
+            return ()
+        try:
+            return tuple(str(each) for each in task.rests_on)
+        except Exception as error:
+            return (f"its assumptions hold, which it failed to name: {UnexpectedError(error)}",)
 
     def _task_state(self) -> str:
         try:

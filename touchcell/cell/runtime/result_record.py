@@ -32,6 +32,7 @@ def result_record(plan: CellPlan, result: RunResult) -> dict[str, Any]:
         "task": plan.task.name,
         "outcome": result.outcome.value,
         "reason": result.reason,
+        "rests_on": list(result.rests_on),
         "state": result.state,
         "duration_s": round(result.duration_s, 6),
         "cycles": result.cycles,

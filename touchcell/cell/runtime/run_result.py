@@ -51,6 +51,7 @@ class RunResult:
         causes: what the supervisor latched, the first cause first.
         stops: how each arm came to rest.
         resets: what was cleared on the way, and by whom, where the run waited for that.
+        rests_on: what nothing has measured and the outcome rests on, each in a phrase that continues "done, as far as".
         lost: whether a device or a process was lost, by which the run ended.
     """
 
@@ -64,4 +65,5 @@ class RunResult:
     causes: tuple[Violation, ...] = ()
     stops: Mapping[str, StopReport] = field(default_factory=dict)
     resets: tuple[ResetDone, ...] = ()
+    rests_on: tuple[str, ...] = ()
     lost: bool = False
