@@ -30,6 +30,10 @@ LEADER_SENSOR: Final = "leader_sensor"
 FOLLOWER_SENSOR: Final = "follower_sensor"
 _CLEAR_M: Final = 0.015
 """Distance by which the follower lets go of an object: a turned one reaches farther while it steps aside."""
+_NEAR_M: Final = 0.006
+"""The same beyond a far side that has been touched where it was expected ..."""
+_AGREES_M: Final = 0.003
+"""... which is within this."""
 _EASED_PER_M: Final = 0.6
 """Depth by which the follower presses less, per depth of the leader beyond that from which it eases."""
 
@@ -189,11 +193,13 @@ class Follow:
         assert push is not None
         while (middle := push.located) is None:
             yield Goal(away, passes=True)
-        far_m = self._middle_m
+        far_m, clear_m = self._middle_m, _CLEAR_M
         if self._far is not None:
             # Where it is longer than was told, there is no room for the way to the far side as it was told.
-            far_m = max(far_m, middle.local((self._far.x, self._far.y))[0] + self._tip_radius_m)
-        at = middle.ahead(far_m + _CLEAR_M)
+            felt_m = middle.local((self._far.x, self._far.y))[0] + self._tip_radius_m
+            clear_m = _NEAR_M if abs(felt_m - far_m) < _AGREES_M else _CLEAR_M
+            far_m = max(far_m, felt_m)
+        at = middle.ahead(far_m + clear_m)
         T_follower_leader = se3.inverse(self._T_leader_follower)
         T = placed(self._T_leader_follower @ away, Pose(at.x, at.y, at.heading + math.pi))
         yield Goal(T_follower_leader @ T)

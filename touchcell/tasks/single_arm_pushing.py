@@ -303,7 +303,8 @@ class Push:
         aim = self._aim
         if aim is None:
             return self._at_limit
-        if self._at_limit and aim.remaining_m > 0.0:
+        within = aim.target_distance_m + _SIGMAS * self._sigma_m <= self._tolerance_m
+        if self._at_limit and aim.remaining_m > 0.0 and not within:
             return f"{self._at_limit}; object {1e3 * aim.target_distance_m:.0f} mm from the target"
         if self._miss_m > self._max_cross_track_m:
             return (
@@ -318,7 +319,7 @@ class Push:
         if aim.target_distance_m > self._tolerance_m:
             distance_mm = 1e3 * aim.target_distance_m
             return f"object {distance_mm:.1f} mm from the target, tolerance {1e3 * self._tolerance_m:g} mm"
-        if aim.target_distance_m + _SIGMAS * self._sigma_m > self._tolerance_m:
+        if not within:
             return (
                 f"object {1e3 * aim.target_distance_m:.1f} mm from the target by an estimate whose standard deviation "
                 f"is {1e3 * self._sigma_m:.1f} mm: it may be beyond the tolerance, {1e3 * self._tolerance_m:g} mm"
