@@ -21,7 +21,7 @@ import numpy as np
 import yaml
 
 from benchmarks.cpu_shares import cpu_shares
-from benchmarks.simulation_checks import Check, checks
+from benchmarks.simulation_checks import Check, checks, quasi_static_yaw
 from benchmarks.simulation_scripts import SCRIPTS, Script, Trace, perform
 from touchcell.cell.bench.provenance import provenance
 from touchcell.cell.config.schema import plan_cell
@@ -83,7 +83,12 @@ def run(arguments: Sequence[str], out: Path) -> None:
     """Print three tables; write ``simulation.json`` and ``simulation.png`` into ``out``."""
     parser = argparse.ArgumentParser(prog="touchcell bench simulation")
     parser.add_argument("--quick", action="store_true", help="the first script and the first cell only")
-    quick = parser.parse_args(arguments).quick
+    parser.add_argument("--yaw", action="store_true", help="how blocks turn in quasi-static physics, and nothing else")
+    options = parser.parse_args(arguments)
+    if options.yaw:
+        _yaw(out)
+        return
+    quick = options.quick
     scripts = dict(list(SCRIPTS.items())[: 1 if quick else None])
     checked = [] if quick else _check()
     fidelity = {name: _compare(name, script) for name, script in scripts.items()}
@@ -98,6 +103,14 @@ def run(arguments: Sequence[str], out: Path) -> None:
     }
     (out / "simulation.json").write_text(json.dumps(result, indent=1) + "\n")
     _plot(fidelity, speed, out / "simulation.png")
+
+
+def _yaw(out: Path) -> None:
+    found = quasi_static_yaw()
+    lines = [f"{each.what:<72}{each.value:>32}  {each.aim:<12}{'' if each.passed else 'MISSED'}" for each in found]
+    text = [f"{key}: {value}" for key, value in provenance().items()]
+    (out / "simulation_yaw.txt").write_text("\n".join([*text, "", *lines]) + "\n")
+    print("\n".join(lines))
 
 
 def _check() -> list[Check]:

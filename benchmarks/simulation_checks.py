@@ -128,6 +128,39 @@ def _yaw() -> list[Check]:
     return found
 
 
+YAW_SIZES_MM = ((60, 60), (80, 80), (50, 120), (120, 50))
+"""Across: of the side that is pushed, in y."""
+YAW_ASIDE_MM = (5, 10)
+
+
+def quasi_static_yaw() -> list[Check]:
+    """Return how blocks that are pushed off centre turn in quasi-static physics, against MuJoCo at 0.1 ms.
+
+    Takes half a minute of a core.
+    """
+    found = []
+    for size_mm in YAW_SIZES_MM:
+        for aside_mm in YAW_ASIDE_MM:
+            fast, fine = (
+                _pushed_yaw_deg(size_mm, aside_mm, physics, {"physics_step_ms": step_ms})
+                for physics, step_ms in (("quasi_static", 1.0), ("dynamic", 0.1))
+            )
+            error = fast / fine - 1.0
+            what = f"yaw of {size_mm[0]} x {size_mm[1]} mm pushed {aside_mm} mm off centre, quasi-static"
+            value = f"{fast:.2f} of {fine:.2f} deg, {100 * error:+.1f} %"
+            found.append(Check(what, value, "within 5 %", abs(error) <= 0.05))
+    return found
+
+
+def _pushed_yaw_deg(size_mm: tuple[int, int], aside_mm: int, physics: str, keys: Mapping[str, Any]) -> float:
+    block = {"shape": {"kind": "box", "size_mm": [*size_mm, 60]}, "mass_g": 479}
+    scene = {"objects": {"block": block}, "table": {"friction": 0.3}, **keys}
+    tip = CommandedTip(scene, (-0.5 * size_mm[0] - 20.2, aside_mm, 30, 0, 90, 0), physics)
+    tip.move((0, 0, 20, 0, 0, 0), 3.0)
+    T = tip.object()
+    return float(np.degrees(np.arctan2(T[1, 0], T[0, 0])))
+
+
 def _toppling() -> list[Check]:
     found = []
     for z_mm, falls in ((140, True), (50, False)):

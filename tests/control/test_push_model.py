@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from touchcell.control.push_model import Contact, PushEstimator, PushModel
+from touchcell.control.push_model import Contact, PushEstimator, PushModel, half_between
 from touchcell.control.push_steering import Pose, steer
 
 # Friction radii from a disc's, two thirds of the reach, to that of an oblong box pushed at its long side.
@@ -101,3 +101,21 @@ def test_a_target_beyond_the_friction_cone_is_told_to_be_missed() -> None:
     assert beside.miss_m > 0.1
     lowest, highest = model.curvatures(0.1)
     assert lowest <= beside.curvature <= highest
+
+
+@pytest.mark.parametrize("beside_m", [0.0, 0.012, -0.02])
+def test_two_contacts_tell_how_long_an_object_between_them_is(beside_m: float) -> None:
+    near = Contact(0.0, 0.0, 0.0)
+    assert half_between(near, Contact(0.11, beside_m, math.pi), flat=True) == pytest.approx(0.055)
+    angle = math.asin(beside_m / 0.04)
+    points = [Contact(-0.04 * math.cos(a), -0.04 * math.sin(a), a) for a in (0.0, math.pi + angle)]
+    assert half_between(*points, flat=False) == pytest.approx(0.04)
+    assert half_between(near, Contact(0.11, beside_m, math.pi - 0.4), flat=True) is None
+    assert half_between(near, Contact(0.0, 0.11, -0.5 * math.pi), flat=False) is None
+
+
+def test_at_another_distance_of_the_centre_the_object_is_as_much_larger() -> None:
+    estimator = PushEstimator(0.04, 0.03**2)
+    estimator.change_reach(0.06)
+    assert estimator.model.reach_m == 0.06
+    assert estimator.model.lever_m2 == pytest.approx(0.045**2)

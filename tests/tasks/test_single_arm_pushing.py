@@ -32,6 +32,7 @@ def test_the_object_is_brought_to_the_target(tmp_path, shape, mass_g, friction):
     prism |= {"mass_g": mass_g} if shape is None else {"mass_g": mass_g, "shape": shape}
     pushed = push(data, tmp_path)
     assert pushed.path == ([*START, *END] if shape is None else [*TOUCH, *END])
+    assert "object_center_offset_mm is right (60 mm were told)" in pushed.result.rests_on[0]
     # That the contact is 3 mm beside the centre is found out.
     assert pushed.object_mm_deg[:2] == pytest.approx(data["task"]["target_mm"], abs=0.6)
 
@@ -123,6 +124,12 @@ def test_a_wall_of_the_workspace_is_not_run_into(tmp_path):
     pushed = push(cell_file(CELL, **SHORT | {"task__target_mm": [200, 0]} | changes), tmp_path)
     assert pushed.path[-2:] == MISSED
     assert "comes to a wall of its workspace" in why_missed(pushed)
+
+
+def test_a_limit_near_the_target_does_not_undo_an_arrival_within_the_tolerance(tmp_path):
+    changes = {"interlocks__workspace__max_mm": [60, 250, 120], "task__arrival_tolerance_mm": 190}
+    pushed = push(cell_file(CELL, **SHORT | {"task__target_mm": [200, 0]} | changes), tmp_path)
+    assert pushed.path[-2:] == END
 
 
 @pytest.mark.parametrize("cell", [CELL, "dual_push_sim.yaml"])

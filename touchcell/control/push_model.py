@@ -130,10 +130,10 @@ class Motion:
     contact_left_m_s: float
 
 
-def half_between(one: Contact, other: Contact) -> float | None:
+def half_between(one: Contact, other: Contact, *, flat: bool) -> float | None:
     """Return the distance from a contact to the middle between it and one on the far side of an object.
 
-    Exact for a straight side with a parallel one behind it, and for a circle. None where the normals do not tell.
+    None where the normals are not those of a straight side and a parallel one behind it, or of a circle (not ``flat``).
     """
     dx, dy = other.x_m - one.x_m, other.y_m - one.y_m
     apart_m, chord = math.hypot(dx, dy), math.atan2(dy, dx)
@@ -141,11 +141,9 @@ def half_between(one: Contact, other: Contact) -> float | None:
     beyond = math.remainder(chord - other.heading_rad - math.pi, 2.0 * math.pi)
     if max(abs(beside), abs(beyond)) > _OPPOSITE_RAD:
         return None
-    if abs(math.remainder(beside - beyond, 2.0 * math.pi)) < _PARALLEL_RAD:
-        return 0.5 * apart_m * math.cos(0.5 * (beside + beyond))
-    if abs(beside + beyond) < _PARALLEL_RAD:
-        return 0.5 * apart_m / math.cos(0.5 * (beside - beyond))
-    return None
+    if flat:
+        return 0.5 * apart_m * math.cos(0.5 * (beside + beyond)) if abs(beside - beyond) < _PARALLEL_RAD else None
+    return 0.5 * apart_m / math.cos(0.5 * (beside - beyond)) if abs(beside + beyond) < _PARALLEL_RAD else None
 
 
 class PushEstimator:

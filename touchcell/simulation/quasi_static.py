@@ -57,6 +57,7 @@ class _Slider:
     Attributes:
         x, y, yaw: of the object's centre of mass in the world, m and rad.
         supports: points of its bottom, over its friction radius.
+        shares: of its weight that each of them bears.
         slide: its motion in the last step: x, y and friction radius times yaw, m.
         weight_n: its own weight plus the downward force of tips.
         com_x, com_y: centre of mass from the object's origin, m.
@@ -80,6 +81,8 @@ class _Slider:
         self.surface = Surface(self.shape, self)
         self.radius_m = friction_radius_m(solid)
         self.supports = tuple((x / self.radius_m, y / self.radius_m) for x, y in supports_m(solid))
+        self.shares = (1.0 / len(self.supports),) * len(self.supports)
+        self._spread = tuple(sum(each[axis] ** 2 for each in self.supports) for axis in (0, 1))
         self.slide: _Three = (0.0, 0.0, 0.0)
         self.friction = body.friction
         gravity = table.gravity_m_s2
@@ -101,6 +104,21 @@ class _Slider:
         """Largest friction force of the table."""
         factor = 1.0 if self._factor is None else self._factor(self.x, self.y)
         return factor * self.friction * self.weight_n
+
+    def lean(self, moment_nm: tuple[float, float], share: float) -> None:
+        """Bear more of the weight where tips push it: what pushes above the table loads the front.
+
+        Args:
+            moment_nm: (x, y) of the tips, along the world's axes.
+            share: of it that friction lets them exert.
+        """
+        count, lever_m = len(self.supports), share / max(self.weight_n * self.radius_m, 1e-9)
+        sin, cos = math.sin(self.yaw), math.cos(self.yaw)
+        ahead = lever_m * (cos * moment_nm[0] + sin * moment_nm[1]) / self._spread[0]
+        left = lever_m * (cos * moment_nm[1] - sin * moment_nm[0]) / self._spread[1]
+        shares = [max(1.0 / count + ahead * x + left * y, 0.0) for x, y in self.supports]
+        total = sum(shares)
+        self.shares = tuple(each / total for each in shares)
 
     def pose(self, t_s: float) -> Array:
         """Return T_world_body (4, 4) at the last step, whatever the time."""
@@ -229,16 +247,17 @@ def _settle(slider: _Slider, tips: Sequence[_Tip], law: ContactLaw) -> _Three:
     friction as a damper of its present speed, which always does.
     """
     slider.weight_n = slider.own_weight_n
-    first, K, down = _force(slider, tips, law, _STILL)
+    first, K, down, moment = _force(slider, tips, law, _STILL)
     slider.weight_n = max(slider.own_weight_n + down, 0.0)
     limit = max(slider.limit_n, 1e-9)
+    slider.lean(moment, min(1.0, limit / max(math.hypot(first[0], first[1]), 1e-12)))
     if math.hypot(*first) <= _SURELY_RESTS * limit:
         return _STILL
     shift = slider.slide if any(slider.slide) else _times(_inverse(K, limit / _LARGEST_M), first)
     if not any(shift):
         shift = (1e-6, 0.0, 0.0)
     held, dampers, curvature, _ = _friction(slider, limit, shift)
-    f, K, _ = _force(slider, tips, law, shift)
+    f, K, _, _ = _force(slider, tips, law, shift)
     left = (f[0] - held[0], f[1] - held[1], f[2] - held[2])
     resting = 0
     for _ in range(_MAX_ITERATIONS):
@@ -248,13 +267,13 @@ def _settle(slider: _Slider, tips: Sequence[_Tip], law: ContactLaw) -> _Three:
         further = _times(_inverse(_sum(K, curvature), _SOFTEST_N_M), left)
         trial = (shift[0] + further[0], shift[1] + further[1], shift[2] + further[2])
         next_held, next_dampers, next_curvature, next_dissipated = _friction(slider, limit, trial)
-        next_f, next_K, _ = _force(slider, tips, law, trial)
+        next_f, next_K, _, _ = _force(slider, tips, law, trial)
         next_left = (next_f[0] - next_held[0], next_f[1] - next_held[1], next_f[2] - next_held[2])
         if math.hypot(*next_left) > 0.9 * size:
             pulled = _times(K, shift)
             trial = _times(_inverse(_sum(K, dampers)), (f[0] + pulled[0], f[1] + pulled[1], f[2] + pulled[2]))
             next_held, next_dampers, next_curvature, next_dissipated = _friction(slider, limit, trial)
-            next_f, next_K, _ = _force(slider, tips, law, trial)
+            next_f, next_K, _, _ = _force(slider, tips, law, trial)
             next_left = (next_f[0] - next_held[0], next_f[1] - next_held[1], next_f[2] - next_held[2])
             resting = resting + 1 if _dot(first, trial) < next_dissipated else 0
             if resting >= _REST_CHECKS or math.hypot(*trial) < _REST_M:
@@ -269,28 +288,28 @@ def _friction(slider: _Slider, limit_n: float, shift: _Three) -> tuple[_Three, _
     the slide, N/m; and the energy that the slide dissipates, J."""
     x, y, turn = shift
     sin, cos = math.sin(slider.yaw), math.cos(slider.yaw)
-    each_n = limit_n / len(slider.supports)
-    fx = fy = ft = way = 0.0
+    fx = fy = ft = dissipated = 0.0
     dd = dxt = dyt = dtt = 0.0
     xx = xy = yy = xt = yt = tt = 0.0
-    for px, py in slider.supports:
+    for (px, py), share in zip(slider.supports, slider.shares, strict=True):
+        each_n = limit_n * share
         rx, ry = cos * px - sin * py, sin * px + cos * py
         vx, vy = x - turn * ry, y + turn * rx
         speed = math.sqrt(vx * vx + vy * vy + _REST_M * _REST_M)
         ux, uy, damper = vx / speed, vy / speed, each_n / speed
         lever = rx * uy - ry * ux
-        way += speed
-        fx, fy, ft = fx + ux, fy + uy, ft + lever
+        dissipated += each_n * speed
+        fx, fy, ft = fx + each_n * ux, fy + each_n * uy, ft + each_n * lever
         dd, dxt, dyt, dtt = dd + damper, dxt - damper * ry, dyt + damper * rx, dtt + damper * (rx * rx + ry * ry)
         # Only motion across its own direction turns a support's friction.
         xx, xy, yy = xx + damper * (1.0 - ux * ux), xy - damper * ux * uy, yy + damper * (1.0 - uy * uy)
         xt, yt = xt + damper * (-ry - ux * lever), yt + damper * (rx - uy * lever)
         tt += damper * (rx * rx + ry * ry - lever * lever)
     return (
-        (each_n * fx, each_n * fy, each_n * ft),
+        (fx, fy, ft),
         (dd, 0.0, dxt, 0.0, dd, dyt, dxt, dyt, dtt),
         (xx, xy, xt, xy, yy, yt, xt, yt, tt),
-        each_n * way,
+        dissipated,
     )
 
 
@@ -337,15 +356,18 @@ def _inverse(K: _Matrix, added: float = 0.0) -> _Matrix:
     )
 
 
-def _force(slider: _Slider, tips: Sequence[_Tip], law: ContactLaw, shift: _Three) -> tuple[_Three, _Matrix, float]:
+def _force(
+    slider: _Slider, tips: Sequence[_Tip], law: ContactLaw, shift: _Three
+) -> tuple[_Three, _Matrix, float, tuple[float, float]]:
     """Return force of all tips on the object moved by ``shift``, in its coordinates; its decrease with the shift to
-    first order; and the downward force of the tips, N."""
+    first order; the downward force of the tips, N; and the moment (x, y) by which they move the weight along the table,
+    N m."""
     radius, stiff_n, nearest = slider.radius_m, law.stiffness_n_m, slider.shape.nearest_numbers
     x, y, yaw = slider.x + shift[0], slider.y + shift[1], slider.yaw + shift[2] / radius
     sin, cos = math.sin(yaw), math.cos(yaw)
     com_x, com_y = slider.com_x, slider.com_y
     force_x, force_y = slider.downhill_n
-    force_turn = down = 0.0
+    force_turn = down = moment_x = moment_y = 0.0
     xx = xy = xt = yx = yy = yt = tx = ty = tt = 0.0
     for tip in tips:
         cx, cy, cz = tip.centre[0] - x, tip.centre[1] - y, tip.centre[2] - slider.z
@@ -357,8 +379,7 @@ def _force(slider: _Slider, tips: Sequence[_Tip], law: ContactLaw, shift: _Three
             continue
         stiff_t = 0.0
         push = -stiff_n * depth
-        fx, fy = push * nx, push * ny
-        down -= push * nz
+        fx, fy, pressed = push * nx, push * ny, -push * nz
         if tip.held is not None:
             sx, sy, sz = px - tip.held[0], py - tip.held[1], pz - tip.held[2]
             along = sx * nx + sy * ny + sz * nz
@@ -368,10 +389,14 @@ def _force(slider: _Slider, tips: Sequence[_Tip], law: ContactLaw, shift: _Three
             if length > longest:
                 stiff_t *= longest / length
             fx, fy = fx + stiff_t * sx, fy + stiff_t * sy
-            down -= stiff_t * sz
+            pressed -= stiff_t * sz
+        down += pressed
         force_x += cos * fx - sin * fy
         force_y += sin * fx + cos * fy
         px, py = px - com_x, py - com_y
+        along_x, along_y = pz * fx + pressed * px, pz * fy + pressed * py
+        moment_x += cos * along_x - sin * along_y
+        moment_y += sin * along_x + cos * along_y
         force_turn += (px * fy - py * fx) / radius
         # For a shift of the object's side against the tip, along the normal and along the tangent. Depth and shear
         # change with the object's motion at the tip's centre.
@@ -382,4 +407,4 @@ def _force(slider: _Slider, tips: Sequence[_Tip], law: ContactLaw, shift: _Three
             xx, xy, xt = xx + pushed_x * wx, xy + pushed_x * wy, xt + pushed_x * felt
             yx, yy, yt = yx + pushed_y * wx, yy + pushed_y * wy, yt + pushed_y * felt
             tx, ty, tt = tx + turned * wx, ty + turned * wy, tt + turned * felt
-    return (force_x, force_y, force_turn), (xx, xy, xt, yx, yy, yt, tx, ty, tt), down
+    return (force_x, force_y, force_turn), (xx, xy, xt, yx, yy, yt, tx, ty, tt), down, (moment_x, moment_y)

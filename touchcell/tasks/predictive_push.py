@@ -249,7 +249,7 @@ class PredictivePush:
         if self._moves or self._must_place or self._contact is None or self._resting is not None:
             return
         near, reach_m = self._contact, self._estimator.model.reach_m
-        self.reach_felt_m = half_between(near, far)
+        self.reach_felt_m = half_between(near, far, flat=self._settings.flat)
         if self.reach_felt_m is not None and abs(self.reach_felt_m - reach_m) > _REACH_M:
             self._settings = replace(self._settings, lead_m=self._settings.tip_radius_m + self.reach_felt_m)
             self._estimator.change_reach(self.reach_felt_m)
