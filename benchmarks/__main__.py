@@ -43,6 +43,7 @@ BENCHMARKS = {
     "simulation": "benchmarks.simulation",
     "structure": "benchmarks.structure",
     "soak": "tests.fault_injection.soak",
+    "steps": "benchmarks.steps",
     "tuning": "benchmarks.tuning",
     "cell-fixture": "benchmarks.cell_fixture",
     "world-faults": "benchmarks.world_faults",

@@ -1,6 +1,6 @@
 """``python -m benchmarks pushes``: whether a push that says done has brought its object to the target.
 
-    python -m benchmarks --out bench pushes [--rigs 60] [--seeds 2 24 29] [--before FILE] [--map]
+    python -m benchmarks --out bench pushes [--rigs 60] [--seeds 2 24 29] [--before FILE] [--map] [--tall]
 
 Each rig is one of the experiments' prisms on one of their tables, pushed by one arm or by two, with truth sampled apart
 from what is told: start to 20 mm and 20 deg off, mass to 50 % and friction to 30 % off, the centre of mass to 10 mm
@@ -9,7 +9,8 @@ push that says done and whose object is farther from its target than the task's 
 ``--rigs 0`` alone) show the object's error over start offset and angle with one arm and with two, over friction and
 mass, and over speed and target, with the shipped network on another tip than it knows, quasi-static. An interrupted
 call goes on where it stopped. ``pushes_time.txt`` says in which states of the task the time passes, and with the
-``pushes.json`` of an earlier call (``--before``) how the same rigs ended then.
+``pushes.json`` of an earlier call (``--before``) how the same rigs ended then. ``--tall`` (with ``--rigs 0``) pushes
+the experiments' tall objects with both arms, half lighter and half heavier than told.
 """
 
 from __future__ import annotations
@@ -37,6 +38,9 @@ from touchcell.cell.experiments.pushing import (
     Pushed,
     push_measures,
 )
+from touchcell.cell.experiments.runner import Scale
+from touchcell.cell.experiments.tall_objects import SPEC as TALL
+from touchcell.cell.experiments.tall_objects import WITH
 from touchcell.cell.experiments.trials import Finished, Perform, Trial
 from touchcell.simulation.objects import TABLES
 
@@ -174,6 +178,7 @@ def run(arguments: Sequence[str], out: Path) -> None:
     parser.add_argument("--seeds", type=int, nargs="*", help="these rigs in place of the first")
     parser.add_argument("--before", type=Path, help="pushes.json of an earlier call, to compare with")
     parser.add_argument("--map", action="store_true", help="draw the maps, too")
+    parser.add_argument("--tall", action="store_true", help="push tall objects that weigh other than told")
     options = parser.parse_args(arguments)
     perform = Perform(measures, out / "pushes")
     rigs = [rig(seed) for seed in options.seeds or range(options.rigs)]
@@ -188,6 +193,8 @@ def run(arguments: Sequence[str], out: Path) -> None:
         (out / "pushes_time.txt").write_text("\n".join([*text, "", *lines]) + "\n")
     if options.map:
         _draw_maps(perform, out)
+    if options.tall:
+        _tall(perform, out)
 
 
 def measures(run: RunFolder) -> dict[str, float]:
@@ -249,6 +256,44 @@ def _rigs(perform: Perform, rigs: Sequence[Rig], out: Path) -> dict[int, Finishe
     ]
     (out / "pushes.json").write_text(json.dumps({"provenance": provenance(), "rigs": rows}, indent=1) + "\n")
     return ended
+
+
+WEIGHTS: Final = (0.5, 1.5)
+"""True weight of tall objects, of what is told."""
+_ARRIVED_MM: Final = 2.0
+
+
+def tall_trials() -> list[tuple[str, float, Trial]]:
+    """Return name, true weight over the told one, and push of each tall object with both arms and the network."""
+    ends = f", {WITH}, learned"
+    found = []
+    for trial in TALL.trials(Scale(trials=1)):
+        name = trial.row.removesuffix(ends)
+        if name == trial.row:
+            continue
+        for weight in WEIGHTS:
+            mass_g = weight * trial.changes["scene.objects"][OBJECT]["mass_g"]
+            changes = {**trial.changes, "truth": {"objects": {OBJECT: {"mass_g": mass_g}}}}
+            found.append((name, weight, Trial(f"{trial.name}_{weight:g}", trial.row, trial.cell, changes)))
+    return found
+
+
+def _tall(perform: Perform, out: Path) -> None:
+    lines = [f"{'':<20}{'weight':>8}{'':>4}{'verdict':<12}{'object mm':>10}{'lean deg':>10}{'push s':>8}"]
+    ended = []
+    for name, weight, trial in tall_trials():
+        ended.append(finished := _performed(perform, trial))
+        found = finished.measures
+        numbers = f"{found.get('object_error_mm', np.nan):>10.2f}{found.get('lean_max_deg', np.nan):>10.1f}"
+        numbers += f"{found.get('push_s', np.nan):>8.1f}  {finished.reason[:80]}"
+        lines.append(f"{name:<20}{weight:>8g}{'':>4}{verdict(finished):<12}{numbers}")
+        print(lines[-1], flush=True)
+    near = sum(each.done and each.measures["object_error_mm"] <= _ARRIVED_MM for each in ended)
+    fallen = sum(each.measures.get("toppled", 0.0) > 0.0 for each in ended)
+    lines += ["", f"of {len(ended)}: {near} arrive within {_ARRIVED_MM:g} mm, {fallen} topple"]
+    print("\n".join(lines))
+    text = [f"{key}: {value}" for key, value in provenance().items()]
+    (out / "pushes_tall.txt").write_text("\n".join([*text, "", *lines]) + "\n")
 
 
 def _performed(perform: Perform, trial: Trial) -> Finished:

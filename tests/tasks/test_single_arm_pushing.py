@@ -113,6 +113,17 @@ def test_a_width_that_was_told_wrong_is_found_out(tmp_path):
     assert pushed.object_mm_deg[:2] == pytest.approx((120.0, 5.0), abs=0.6)
 
 
+def test_an_object_that_is_first_touched_at_a_corner_between_two_sides_arrives(tmp_path):
+    """The corner looks like a side of which nothing else is so."""
+    changes = {"task__target_mm": [150, 20], "task__object_center_offset_mm": 55, "task__side_width_mm": 40.4}
+    data = cell_file(CELL, scene__step_ms=10, **changes, arms__arm__start_pose_mm_deg=[-75, 0, 30, 180, 0, 0])
+    hexagon = {"kind": "hexagon", "width_mm": 70, "height_mm": 60}
+    data["scene"]["objects"]["prism"] |= {"shape": hexagon, "pose_mm_deg": [5.85, 12.6, 0, 0, 0, -18.2]}
+    pushed = push(data, tmp_path)
+    assert pushed.path[-1] == END[-1]
+    assert pushed.object_mm_deg[:2] == pytest.approx((150.0, 20.0), abs=0.6)
+
+
 def test_a_target_that_asks_for_more_tilt_than_is_allowed_is_given_up(tmp_path):
     pushed = push(cell_file(CELL, scene__step_ms=10, task__target_mm=[60, 200]), tmp_path)
     assert pushed.path[-2:] == MISSED

@@ -53,6 +53,8 @@ class EdgeSearch:
         self._step_m = _STEP_M
         self._touches = 0
         self._edge = self._side
+        self.at_first: Contact | None = None
+        """The touch of the edge, where it was at the first contact: this may have been with the edge, too."""
         self.middle: Contact | None = None
         """The side's middle, by the width that is expected; None until the edge has been found."""
 
@@ -98,6 +100,8 @@ class EdgeSearch:
             self._left = math.copysign(1.0, towards.local((edge.x, edge.y))[1])
             self._find(Pose(edge.x, edge.y, towards.heading))
         elif -self._left * turned > _EDGE_RAD:
+            if math.hypot(contact.x_m - self._side.x, contact.y_m - self._side.y) < _APART_M:
+                self.at_first = contact
             self._find(Pose(contact.x_m, contact.y_m, self._side.heading))
         else:
             self._flat_m = self._at_m

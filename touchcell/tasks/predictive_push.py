@@ -71,6 +71,12 @@ _FARTHEST_APART_M: Final = 0.025
 """... and from its middle: farther ones tell no more ..."""
 _LEAST_APART_M: Final = 0.006
 """... and nearer ones do not tell how it is turned."""
+_BEYOND_CORNER_M: Final = 0.012
+"""Distance from a corner at which it shows whether there is another side."""
+_SAME_SIDE_RAD: Final = math.radians(8.0)
+"""Difference of directions up to which touches may be of one straight side."""
+_UNCONFIRMED_M: Final = 0.005
+"""Standard deviation of a middle between two edges where nothing shows that there is a side between them."""
 _FLAT_RAD: Final = math.radians(3.0)
 """Turn of the normal between them from which a side is not flat."""
 
@@ -346,6 +352,11 @@ class PredictivePush:
         for is_told in (told is not None, True):
             one = EdgeSearch(side, expected_m, width_m, settings.tip_radius_m)
             yield from self._feel(T_base_sensor, one, _CLEAR_M)
+            if one.at_first is not None and (beyond := (yield from self._side_beyond(T_base_sensor, one))):
+                # The first contact was a corner between two sides.
+                side, expected_m = beyond, one.left * (0.5 * width_m - _BEYOND_CORNER_M)
+                one = EdgeSearch(side, expected_m, width_m, settings.tip_radius_m)
+                yield from self._feel(T_base_sensor, one, _CLEAR_M)
             if one.middle is None:
                 break
             other = one.opposite()
@@ -357,10 +368,30 @@ class PredictivePush:
             sigma_m = max(_EDGES_SIGMA_M, 0.5 * abs(felt_m - width_m))
             if not is_told or sigma_m < 0.5 * _WIDTH_M:
                 touches = yield from self._touch_twice(T_base_sensor, found, 0.5 * felt_m, other.left)
-                return self._straightened(found, touches), _EDGES_SIGMA_M
+                straight = self._straightened(found, touches)
+                # Where nothing shows that there is a side between the edges, they may be anything else.
+                confirmed = straight is not None or 0.5 * felt_m - _FROM_EDGE_M < _LEAST_APART_M
+                return straight or found, _EDGES_SIGMA_M if confirmed else max(sigma_m, _UNCONFIRMED_M)
             # Either the width is not what was told, or something else was taken for an edge.
             side, expected_m, width_m = found, 0.0, felt_m
         return found, sigma_m
+
+    def _side_beyond(self, T_base_sensor: Array, edge: EdgeSearch) -> Generator[Goal, None, Contact | None]:
+        """Touch farther out than an edge, and return the contact if there is another side with its normal."""
+        corner = edge.at_first
+        assert corner is not None
+        at = _pose_of(corner).ahead(edge.left * _BEYOND_CORNER_M, 0.5 * math.pi)
+        clear = at.ahead(-self._settings.tip_radius_m - _CLEAR_M)
+        yield Goal(placed(T_base_sensor, clear), passes=True)
+        yield Goal(placed(T_base_sensor, clear.ahead(2.0 * _CLEAR_M)), feels=True, slow_m=_CLEAR_M + _SLOW_M)
+        felt = self._felt
+        yield Goal(placed(T_base_sensor, clear), passes=True)
+        if felt is None:
+            return None
+        ahead_m, left_m = _pose_of(felt).local((corner.x_m, corner.y_m))
+        turned = math.remainder(felt.heading_rad - corner.heading_rad, 2.0 * math.pi)
+        straight = abs(left_m) > 0.5 * _BEYOND_CORNER_M and abs(ahead_m) < math.tan(_SAME_SIDE_RAD) * abs(left_m)
+        return felt if straight and abs(turned) < _SAME_SIDE_RAD else None
 
     def _touch_twice(
         self, T_base_sensor: Array, middle: Contact, half_m: float, left: float
@@ -383,21 +414,22 @@ class PredictivePush:
             yield Goal(placed(T_base_sensor, clear), passes=True)
         return touches
 
-    def _straightened(self, middle: Contact, touches: Sequence[Contact]) -> Contact:
+    def _straightened(self, middle: Contact, touches: Sequence[Contact]) -> Contact | None:
         """Return the middle of a side as the arm's positions at two touches of it say that it lies.
 
-        Both touches are misread by the same: their normals do not count, nor does what that shifts the edges.
+        Both touches are misread by the same: their normals do not count, nor does what that shifts the edges. None
+        where they are not on a straight side there.
         """
         if len(touches) < 2:
-            return middle
+            return None
         right, left = sorted(touches, key=lambda each: _pose_of(middle).local((each.x_m, each.y_m))[1])
         turned = math.remainder(left.heading_rad - right.heading_rad, 2.0 * math.pi)
         if abs(turned) > _FLAT_RAD:
-            return middle
+            return None
         heading = math.atan2(left.y_m - right.y_m, left.x_m - right.x_m) - 0.5 * math.pi
         misread = math.remainder(right.heading_rad + 0.5 * turned - heading, 2.0 * math.pi)
-        if abs(math.remainder(heading - middle.heading_rad, 2.0 * math.pi)) > _SIDE_SIGMA_RAD:
-            return middle
+        if max(abs(misread), abs(math.remainder(heading - middle.heading_rad, 2.0 * math.pi))) > _SAME_SIDE_RAD:
+            return None
         # What is misread of the tilt moves the point at which a round tip seems to touch.
         x, y = 0.5 * (left.x_m + right.x_m), 0.5 * (left.y_m + right.y_m)
         line = Pose(x, y, heading)
