@@ -30,6 +30,8 @@ AT_S: Final = 6.0
 _WITHIN_S: Final = 0.05
 _WATCHED_S: Final = 3.0
 _END_S: Final = 0.5
+_DEPTH_MM: Final = 4.0
+"""As far from what interlocks allow as the jumps are."""
 _SETTLED: Final = 0.1
 TIPS: Final[Mapping[str, Mapping[str, Any]]] = {
     "matched": {},

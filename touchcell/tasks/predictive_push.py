@@ -365,7 +365,9 @@ class PredictivePush:
                 found, sigma_m = one.middle, _EDGE_SIGMA_M if is_told else sigma_m
                 break
             found, felt_m = one.between(other)
-            sigma_m = max(_EDGES_SIGMA_M, 0.5 * abs(felt_m - width_m))
+            # An edge that was felt wrong at first does not make the width wrong that was told.
+            off_m = min(abs(felt_m - width) for width in (width_m, told) if width is not None)
+            sigma_m = max(_EDGES_SIGMA_M, 0.5 * off_m)
             if not is_told or sigma_m < 0.5 * _WIDTH_M:
                 touches = yield from self._touch_twice(T_base_sensor, found, 0.5 * felt_m, other.left)
                 straight = self._straightened(found, touches)
