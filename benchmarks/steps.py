@@ -49,6 +49,7 @@ def trial(component: str, tip: str) -> Trial:
         "seed": 1,
         **TIPS[tip],
     }
+    changes["task.depth_mm"] = _DEPTH_MM
     return Trial(f"{component}_{tip.replace(' ', '_')}", tip, CELL, changes)
 
 
@@ -76,7 +77,9 @@ def response(t_s: Array, error: Array, size: float) -> dict[str, float]:
 
 def measures(run: RunFolder) -> dict[str, float]:
     """Return the response of the component that the plate jumps in."""
-    moved = run.plan.cell.scene["surfaces"]["plate"]["motion"]["displacement_mm_deg"]
+    scene = run.plan.cell.scene
+    assert scene is not None
+    moved = scene["surfaces"]["plate"]["motion"]["displacement_mm_deg"]
     axis = int(np.argmax(np.abs(moved)))
     poses, _, error = tracking(run)
     known = np.isfinite(error[:, axis]) & (poses.t_s < AT_S + _WATCHED_S)
