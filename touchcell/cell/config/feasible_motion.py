@@ -160,9 +160,13 @@ def _lifted_out(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
     """Gaps between tip and a known surface at which the sensor is outside a box that it must not leave."""
     clearance_mm = getattr(plan.task_config, "clearance_mm", None)
     aside_mm = float(getattr(plan.task_config, "shear_mm", 0.0))
-    for role, name in plan.sensor_roles.items() if clearance_mm is not None else ():
+    if clearance_mm is None:
+        return
+    for role, name in plan.sensor_roles.items():
         surface = pose_of(getattr(plan.cell.sensors[name].estimator, "surface_mm_deg", None))
-        for rule, box in _boxes(plan).items() if surface is not None else ():
+        if surface is None:
+            continue
+        for rule, box in _boxes(plan).items():
             lifted_mm = 1e3 * surface[:3, 3] - clearance_mm * surface[:3, 2]
             if box.sensor == role and (outside := _outside(lifted_mm, box, aside_mm + _EXACTNESS_MM)):
                 yield file.problem(
