@@ -97,6 +97,11 @@ EQUIVALENT: Mapping[tuple[str, str, str], str] = {
     ("clearance", "if widest_m > slow_m and len(near) == len(bodies):", "if -> if False"): SHORTCUT,
     ("clearance", "if number % 2 or np.linalg.norm(placed[:3, 3]) > reach_m:", "Gt -> GtE"): EXACT,
     ("depth_disagrees", "if slid_m > self.slide_m:", "Gt -> GtE"): EXACT,
+    (
+        "depth_disagrees",
+        "if mark is not None:",
+        "if -> if True",
+    ): "None is as no mark",
     ("motion", "command = TwistCommand(twist, TwistFrame.BASE, view.now_ns, 0.03)", "0.03 -> 0.06"): (
         "nothing reads the time-to-live of a fault's command"
     ),

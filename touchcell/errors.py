@@ -27,6 +27,14 @@ class TouchcellError(Exception):
         return f"{self.message} ({self.hint})" if self.hint else self.message
 
 
+def described(error: BaseException) -> str:
+    """Return what ``repr`` says of an exception, or its type's name if that raises itself."""
+    try:
+        return repr(error)
+    except Exception:
+        return f"{type(error).__name__}()"
+
+
 def suggest(word: str, known: Iterable[str], *, otherwise: str = "known") -> str:
     """A hint for an unknown ``word``: "did you mean" one of ``known``, or all of them after ``otherwise``."""
     names = sorted(known)

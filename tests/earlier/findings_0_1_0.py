@@ -71,7 +71,7 @@ def answers(cells: dict[str, Any]) -> str:
     return f"{len(accepted)} of {len(cells)} accepted: {', '.join(accepted)}"
 
 
-def cli(*arguments: object, shell: str = "", timeout_s: float = 120.0) -> tuple[int, str]:
+def cli(*arguments: object, shell: str = "", timeout_s: float = 600.0) -> tuple[int, str]:
     command = [sys.executable, "-c", "import sys; from cell.cli import main; sys.exit(main())", *map(str, arguments)]
     if shell:
         command = ["bash", "-c", shell, "bash", *command]

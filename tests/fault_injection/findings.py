@@ -110,7 +110,7 @@ def _check(folder: Path, data: Mapping[str, Any] | str | bytes) -> str:
     return ""
 
 
-def _cli(*arguments: object, folder: Path, shell: str = "", timeout_s: float = 120.0) -> tuple[int, str]:
+def _cli(*arguments: object, folder: Path, shell: str = "", timeout_s: float = 600.0) -> tuple[int, str]:
     """Exit code and output of ``touchcell`` in a process of its own."""
     command = [sys.executable, "-m", "touchcell", *map(str, arguments)]
     environment = {**os.environ, "PYTHONPATH": str(CHECKOUT)}

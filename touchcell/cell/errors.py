@@ -5,7 +5,7 @@ from __future__ import annotations
 import traceback
 from pathlib import Path
 
-from touchcell.errors import TouchcellError
+from touchcell.errors import TouchcellError, described
 
 
 class RecordingError(TouchcellError):
@@ -30,5 +30,5 @@ class UnexpectedError(TouchcellError):
     def __init__(self, cause: BaseException) -> None:
         frames = traceback.extract_tb(cause.__traceback__)
         where = f"{frames[-1].filename}:{frames[-1].lineno}: " if frames else ""
-        super().__init__(f"{where}{cause!r}", hint="this is a mistake in the code, not in the cell")
+        super().__init__(f"{where}{described(cause)}", hint="this is a mistake in the code, not in the cell")
         self.cause = cause

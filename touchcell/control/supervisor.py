@@ -19,6 +19,7 @@ from touchcell.control.interlocks.violation import Severity, Violation
 from touchcell.control.latch import Latch, LatchState, ResetDone, ResetRefused
 from touchcell.control.rest import RestMonitor
 from touchcell.drivers.core.device import OperatorToken
+from touchcell.errors import described
 
 LIMIT_FOR_NS: Final = 300_000_000
 """An interlock that limits for longer trips, whatever its subjects were and however it flickered."""
@@ -139,7 +140,7 @@ class Supervisor:
             return found
         for name, rule in self._levelled:
             # What is only shown disturbs nothing.
-            with suppress(Exception):
+            with suppress(BaseException):
                 found += [(name, level) for level in rule.levels(self._view, NO_MARKS)]
         return found
 
@@ -193,6 +194,6 @@ class Supervisor:
 def _checked(interlock: Interlock, view: CellView) -> Violation | None:
     try:
         return interlock.check(view)
-    except Exception as error:
-        reason = f"the interlock could not be evaluated: {error!r}"
+    except BaseException as error:
+        reason = f"the interlock could not be evaluated: {described(error)}"
         return Violation(interlock.name, Severity.FAULT, "cell", reason, view.now_ns, raised=True)

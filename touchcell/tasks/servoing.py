@@ -8,7 +8,7 @@ from enum import Enum, auto
 from typing import Annotated, Final, TypeVar
 
 import numpy as np
-from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat
 
 from touchcell.drivers.core.commands import TwistCommand, TwistFrame
 from touchcell.drivers.core.protocols import SERVO_ARM
@@ -67,7 +67,7 @@ class ServoConfig(ContactServoConfig):
         check_s: duration of the motion after first contact whose measured answer must agree with the arm's before the
             arm servos on a model's estimates (``sensor_check``); 0 leaves it out.
         check_press_mm: depth that this motion adds.
-        check_shift_mm: its largest shift along the surface.
+        check_shift_mm: its largest shift along the surface; at most the shear up to which models are taught.
         check_tilt_deg: its largest tilt.
         settle_time_s: the contact has settled when errors were below the tolerances for this long.
         settle_timeout_s: settling fails when it takes longer.
@@ -86,7 +86,7 @@ class ServoConfig(ContactServoConfig):
     approach_distance_mm: PositiveFloat = 50.0
     check_s: NonNegativeFloat = 1.0
     check_press_mm: Annotated[NonNegativeFloat, DEPTH] = 0.5
-    check_shift_mm: PositiveFloat = 0.3
+    check_shift_mm: Annotated[PositiveFloat, Field(le=5.0)] = 0.3
     check_tilt_deg: PositiveFloat = 1.0
     settle_time_s: NonNegativeFloat = 0.3
     settle_timeout_s: PositiveFloat = 10.0

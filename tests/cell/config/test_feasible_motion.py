@@ -81,6 +81,12 @@ WAYS = [
     ("surface_follow_dome_sim", [("task.distance_mm", 300)], "task.distance_mm", "x = 12"),
     ("surface_mesh_sim", [("interlocks.workspace.max_mm", [10, 100, 100])], "task.path", "x = 30 mm, limit 10 mm"),
     (FOLLOW, [("task.retract_mm", 140)], "task.retract_mm", "z = 1"),
+    (
+        "collect_sim",
+        [("task.clearance_mm", 200)],
+        "task.clearance_mm",
+        "known surface 'sensor' leaves .* z = 220 mm",
+    ),
 ]
 WAYS += [
     ("object_track_sim", [("interlocks.workspace.max_mm", [30, 200, 120])], "task.duration_s", "x = .* limit 30 mm"),
@@ -120,6 +126,7 @@ TOUCHES = [
 TIMES = [
     (FOLLOW, [("task.max_frame_age_ms", 5)], "task.max_frame_age_ms", "come after 10 ms"),
     (FOLLOW, [("task.kp_per_s", [0, 0, 300, 8, 8, 0])], "task.kp_per_s", "overshoots by more than the error"),
+    (FOLLOW, [("task.check_shift_mm", 10)], "task.check_shift_mm", "less than or equal to 5"),
     (FOLLOW, [("task.kp_per_s", [0, 0, -8, 8, 8, 0])], "task.kp_per_s.2", "greater than or equal to 0"),
 ]
 
@@ -170,6 +177,12 @@ FAILING = [
     (FOLLOW, [("task.settle_timeout_s", 0.2)], "task.settle_timeout_s", "0.3 s at least to settle"),
     (FOLLOW, [("task.prepare_timeout_s", 0.1)], "task.prepare_timeout_s", "0.2 s at least to back off"),
     (PUSH, [("task.push_timeout_s", 1)], "task.push_timeout_s", "at least to push so far"),
+    (
+        "object_track_sim",
+        [("scene.surfaces.plate.motion.period_s", 2), ("task.duration_s", 10)],
+        "arms.arm.limits.tcp_speed_m_s",
+        "150 mm/s is less than what 'sensor' is carried along with: it falls 60 mm behind",
+    ),
 ]
 
 
@@ -185,6 +198,7 @@ def test_a_run_that_would_end_as_failed_is_said_and_not_refused(
 
 
 ACCEPTED = [
+    ("collect_sim", [("task.clearance_mm", 40)]),
     (FOLLOW, [("interlocks.uncertain.limit_mm", 0.2)]),
     (FOLLOW, [("interlocks.shear.limit_mm", 4)]),
     (PUSH, [("interlocks.shear.limit_mm", 1)]),
@@ -209,6 +223,14 @@ ACCEPTED = [
 @pytest.mark.parametrize(("name", "changes"), ACCEPTED)
 def test_what_a_run_may_well_do_is_accepted(cell: Callable[..., Path], name: str, changes: list[Change]) -> None:
     assert not plan_cell(cell(name, *changes)).foreseen
+
+
+@pytest.mark.parametrize("period_s", [20, 6])
+def test_an_object_that_the_arm_keeps_up_with_is_nothing_to_speak_of(
+    cell: Callable[..., Path], period_s: float
+) -> None:
+    path = cell("object_track_sim", ("scene.surfaces.plate.motion.period_s", period_s))
+    assert not [note for note in plan_cell(path).notes if "each run would fail" in note]
 
 
 def test_check_refuses_what_each_run_would_trip_on_and_a_run_says_so_and_trips(

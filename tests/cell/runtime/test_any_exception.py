@@ -28,15 +28,25 @@ from touchcell.cell.runtime.run_states import RunState
 from touchcell.drivers.core.errors import DeviceFault, DeviceGone
 from touchcell.drivers.core.protocols import StopCategory
 
-EXCEPTIONS: dict[str, Callable[[], Exception]] = {
+
+class Unspeakable(Exception):
+    """Raises when it is asked what it says."""
+
+    def __repr__(self) -> str:
+        raise RuntimeError("no words")
+
+    __str__ = __repr__
+
+
+EXCEPTIONS: dict[str, Callable[[], BaseException]] = {
     "OSError": lambda: OSError(errno.EPIPE, "broken pipe"),
     "ValueError": lambda: ValueError("a value"),
-    "TypeError": lambda: TypeError("a type"),
-    "KeyError": lambda: KeyError("a key"),
     "MemoryError": lambda: MemoryError(),
     "RecursionError": lambda: RecursionError("too deep"),
-    "AssertionError": lambda: AssertionError(),
-    "TimeoutError": lambda: TimeoutError("late"),
+    "SystemExit": lambda: SystemExit(0),
+    "KeyboardInterrupt": KeyboardInterrupt,
+    "GeneratorExit": GeneratorExit,
+    "unspeakable": Unspeakable,
     "DeviceFault": lambda: DeviceFault("leader", "it complains"),
     "DeviceGone": lambda: DeviceGone("leader", "unplugged"),
     "RecordingError": lambda: RecordingError(Path("run.mcap"), "cannot be written"),
@@ -46,7 +56,7 @@ EXCEPTIONS: dict[str, Callable[[], Exception]] = {
 class Raises:
     """Replaces a method: does as it did until it is armed, then raises."""
 
-    def __init__(self, owner: Any, method: str, error: Exception) -> None:
+    def __init__(self, owner: Any, method: str, error: BaseException) -> None:
         self._was, self._error = getattr(owner, method), error
         self.armed = False
         object.__setattr__(owner, method, self)
@@ -60,7 +70,7 @@ class Raises:
 class Replaced:
     """Replaces one rule of a supervisor by one that raises."""
 
-    def __init__(self, cell: Cell, error: Exception) -> None:
+    def __init__(self, cell: Cell, error: BaseException) -> None:
         self.armed = False
         self.name, self._error = "broken", error
         supervisor: Any = cell.supervisor
@@ -71,7 +81,7 @@ class Replaced:
             raise self._error
 
 
-PLACES: dict[str, Callable[[Cell, Recorder, BlackBox, Exception], Any]] = {
+PLACES: dict[str, Callable[[Cell, Recorder, BlackBox, BaseException], Any]] = {
     "a driver's stop": lambda cell, recorder, box, error: Raises(cell.arms["leader"], "stop", error),
     "a driver's state": lambda cell, recorder, box, error: Raises(cell.arms["leader"], "tcp", error),
     "a driver's at_rest": lambda cell, recorder, box, error: Raises(cell.arms["leader"], "at_rest", error),
@@ -171,7 +181,9 @@ def test_an_exception_stops_every_arm_in_the_same_moment(
 
 @pytest.mark.parametrize(
     ("place", "kind"),
-    sampled(product([place for place in PLACES if place not in HARMLESS], ["ValueError", "DeviceGone"]), 11),
+    sampled(
+        product([place for place in PLACES if place not in HARMLESS], ["ValueError", "DeviceGone", "SystemExit"]), 11
+    ),
 )
 def test_the_command_leaves_a_result_a_black_box_and_the_right_exit_code(
     tmp_path: Path, cell_path: Path, monkeypatch: pytest.MonkeyPatch, place: str, kind: str
@@ -198,5 +210,5 @@ def test_the_command_leaves_a_result_a_black_box_and_the_right_exit_code(
     assert code == (EXIT_DEVICE_LOST if lost else EXIT_TRIPPED if trips else EXIT_TASK_FAILED)
 
 
-def _raise(error: Exception) -> None:
+def _raise(error: BaseException) -> None:
     raise error

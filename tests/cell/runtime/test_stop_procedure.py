@@ -172,7 +172,7 @@ def test_an_arm_that_raises_is_named_in_log_and_record_and_the_other_is_stopped(
     with caplog.at_level(logging.ERROR):
         bench.stopped()
     assert "left could not be told to stop" in caplog.text
-    assert bench.events == [("stop failed", "left: broken pipe")]
+    assert bench.events == [("stop failed", "left: OSError('broken pipe')")]
     assert bench.arms["right"].stops == [StopCategory.STOP_AND_HOLD]
 
 

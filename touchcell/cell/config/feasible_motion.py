@@ -49,7 +49,7 @@ Ways = Mapping[KeyPath, Array]
 
 def foreseen_trips(file: YamlFile, plan: CellPlan, ways: Ways) -> Iterator[ConfigError]:
     """Return one problem for every parameter of a task with which each run would trip; else nothing is wrong."""
-    for problems in (_ages, _gates, _too_light, _gains, _pressing):
+    for problems in (_ages, _gates, _too_light, _gains, _pressing, _lifted_out):
         yield from problems(file, plan)
     yield from _ways_out(file, plan, ways)
     yield from _untouched(file, plan)
@@ -60,7 +60,7 @@ def failing_motions(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
 
     Such a cell may be meant, as in a test of that very end, and is not refused.
     """
-    for problems in (_impossible, _times, _unmet):
+    for problems in (_impossible, _times, _unmet, _left_behind):
         yield from problems(file, plan)
 
 
@@ -154,6 +154,62 @@ def _ways(plan: CellPlan) -> Iterator[tuple[KeyPath, Array]]:
                 # The contact is made a little later, when the surface has moved on.
                 inner = (way - base[:3, 3]) @ base[:3, :3]
                 yield motion.key, inner + (inner[0] - inner) * min(1.0, _RIDE_SLACK_M / _extent(inner))
+
+
+def _lifted_out(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
+    """Gaps between tip and a known surface at which the sensor is outside a box that it must not leave."""
+    clearance_mm = getattr(plan.task_config, "clearance_mm", None)
+    aside_mm = float(getattr(plan.task_config, "shear_mm", 0.0))
+    if clearance_mm is None:
+        return
+    for role, name in plan.sensor_roles.items():
+        surface = pose_of(getattr(plan.cell.sensors[name].estimator, "surface_mm_deg", None))
+        if surface is None:
+            continue
+        for rule, box in _boxes(plan).items():
+            lifted_mm = 1e3 * surface[:3, 3] - clearance_mm * surface[:3, 2]
+            if box.sensor == role and (outside := _outside(lifted_mm, box, aside_mm + _EXACTNESS_MM)):
+                yield file.problem(
+                    ("task", "clearance_mm"),
+                    f"that far from the known surface {name!r} leaves interlocks.{rule}, which would trip: {outside}",
+                    value=clearance_mm,
+                    hint="leave less, or make the workspace larger",
+                )
+                return
+
+
+def _left_behind(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
+    """Motions of what a contact goes along with that its arm cannot keep up with."""
+    start, mount = start_of_sensor(plan)
+    reach_mm = getattr(plan.task_config, "approach_distance_mm", None)
+    if plan.cell.scene is None or plan.task.motions is None or not plan.sensor_roles or reach_mm is None:
+        return
+    name = plan.sensor_roles[min(plan.sensor_roles)]
+    tip, arm = _tip(plan, name), plan.cell.sensors[name].mounted_on
+    limits = None if arm is None else getattr(plan.arms[arm].config, "limits", None)
+    if tip is None or not isinstance(limits, LimitsConfig):
+        return
+    scene = scene_section().model_validate(plan.cell.scene)
+    for motion in plan.task.motions(plan.task_config, start, mount):
+        if not isinstance(motion, PlannedRide):
+            continue
+        way_m = scene.ride(tip, 1e-3 * reach_mm, motion.lasts_s)
+        if way_m is None:
+            continue
+        step_m = limits.tcp_speed_m_s * motion.lasts_s / max(len(way_m) - 1, 1)
+        behind_m, farthest_m, at = 0.0, 0.0, way_m[0]
+        for ahead in way_m[1:]:
+            behind_m = float(np.linalg.norm(ahead - at))
+            at = ahead if behind_m <= step_m else at + (ahead - at) * step_m / behind_m
+            farthest_m = max(farthest_m, behind_m - step_m)
+        if farthest_m > _RIDE_SLACK_M:
+            yield file.problem(
+                ("arms", str(arm), "limits", "tcp_speed_m_s"),
+                f"{1e3 * limits.tcp_speed_m_s:g} mm/s is less than what {name!r} is carried along with: "
+                f"it falls {1e3 * farthest_m:.0f} mm behind",
+                value=limits.tcp_speed_m_s,
+                hint="raise it, with interlocks.tcp_speed and the margins, or let the object move more slowly",
+            )
 
 
 def _extent(way_m: Array) -> float:

@@ -70,7 +70,7 @@ class HealthMonitor:
             except TouchcellError as error:
                 _logger.info("%s: no health: %s", device.name, error)
                 continue
-            except Exception:
+            except BaseException:
                 _logger.exception("%s: its driver failed to report its health, and is not asked again", device.name)
                 self._devices.remove(device)
                 continue

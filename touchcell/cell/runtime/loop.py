@@ -127,7 +127,7 @@ class RunLoop:
                 # In real time it has to catch up with all that happened since it was made.
                 cell.scene.objects()
             cell.watchdog.begin()
-        except Exception as error:
+        except BaseException as error:
             self._fail(error)
         self._start_ns = cell.clock.now_ns()
         self._fire(STARTED)
@@ -146,7 +146,7 @@ class RunLoop:
                 self._work()
             elif self.state is RunState.WAITING_FOR_RESET:
                 self._wait()
-        except Exception as error:
+        except BaseException as error:
             self._fail(error)
         if self.state in (RunState.RUNNING, RunState.WAITING_FOR_RESET) and self._record.error is not None:
             self._fail(self._record.error)
@@ -307,16 +307,17 @@ class RunLoop:
             t_s = (self._cell.clock.now_ns() - self._cell.start_ns) * 1e-9
             self._on_cycle(Progress(t_s, self._cell.task.state, {}, {}, waiting))
 
-    def _fail(self, error: Exception) -> None:
+    def _fail(self, error: BaseException) -> None:
         """Stop because of ``error``; a run that may wait for a reset treats a device's like any other trip."""
-        logger.error("%s: %s", self.state.name.lower(), error, exc_info=error)
+        found = error if isinstance(error, TouchcellError) else UnexpectedError(error)
+        logger.error("%s: %s", self.state.name.lower(), found, exc_info=error)
         self._lost = self._lost or isinstance(error, DeviceGone | ConnectError)
         at_work = self.state in (RunState.RUNNING, RunState.WAITING_FOR_RESET)
         if isinstance(error, DeviceError) and self._reset is not None and at_work:
             self._distrust(error)
             return
-        self._error = self._error or (error if isinstance(error, TouchcellError) else UnexpectedError(error))
-        self._fire(FAULT, str(error))
+        self._error = self._error or found
+        self._fire(FAULT, str(found))
 
     def _distrust(self, error: DeviceError) -> None:
         """Latch what a device has raised."""
@@ -395,7 +396,7 @@ class RunLoop:
         try:
             outcome = _OUTCOMES.get(task.state, Outcome.DONE if task.succeeded else Outcome.FAILED)
             return outcome, _reason(task.transitions, outcome)
-        except Exception as error:
+        except BaseException as error:
             return Outcome.ERROR, str(UnexpectedError(error))
 
     def _rests_on(self, task: Task) -> tuple[str, ...]:
@@ -409,7 +410,7 @@ class RunLoop:
     def _task_state(self) -> str:
         try:
             return self._cell.task.state
-        except Exception:
+        except BaseException:
             return "unknown"
 
     def _why(self, stop: TransitionRecord) -> str:
@@ -435,7 +436,7 @@ def _logged(what: str) -> Iterator[None]:
         yield
     except DeviceError as error:
         logger.warning("%s: %s", what, error)
-    except Exception:
+    except BaseException:
         logger.exception(what)
 
 

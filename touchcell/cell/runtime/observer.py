@@ -18,7 +18,7 @@ from touchcell.drivers.core.commands import Sent, TwistCommand
 from touchcell.drivers.core.errors import DeviceFault
 from touchcell.drivers.core.protocols import ReadingSource
 from touchcell.drivers.core.samples import Health, JointState, Stamped, TcpState
-from touchcell.errors import TouchcellError
+from touchcell.errors import TouchcellError, described
 from touchcell.geometry import se3
 from touchcell.geometry.finite import all_finite
 from touchcell.geometry.types import Array
@@ -164,10 +164,11 @@ def call_driver(device: str, call: Callable[[], _T]) -> _T:
     """Call a driver; whatever it raises that is no TouchcellError comes out as a DeviceFault of ``device``."""
     try:
         return call()
-    except TouchcellError:
+    except (TouchcellError, KeyboardInterrupt):
         raise
-    except Exception as error:
-        raise DeviceFault(device, f"its driver raised {error!r}") from error
+    except BaseException as error:
+        # A driver that calls sys.exit, too: that is no end of a run.
+        raise DeviceFault(device, f"its driver raised {described(error)}") from error
 
 
 def _sensor_view(estimate: ContactEstimate, sensor: Sensor) -> SensorView:

@@ -102,7 +102,7 @@ class RunRecord:
         """Record one arm on its way to rest."""
         try:
             message = tcp_message(state)
-        except Exception as error:
+        except BaseException as error:
             # What cannot be recorded does not keep an arm from being watched.
             self.event("no pose", f"{role}: {error}")
         else:
@@ -215,7 +215,7 @@ class RunRecord:
         """Encode one message, to be kept with all others of its cycle."""
         try:
             self._pending.append((topic, t_ns, self._encoder.encode(topic, message)))
-        except Exception as error:
+        except BaseException as error:
             # A value of a plug-in's that is neither number, text, list nor mapping; the rest of the run is recorded.
             logger.exception("a message of %s is left out", topic)
             self.error = self.error or UnexpectedError(error)
@@ -229,7 +229,7 @@ class RunRecord:
         if self._box is not None:
             try:
                 self._box.add(pending)
-            except Exception:
+            except BaseException:
                 logger.exception("the black box failed and takes no more messages")
                 self._box = None
         if self._recorder is None:
@@ -238,14 +238,14 @@ class RunRecord:
             self._recorder.write_encoded(pending)
         except RecordingError as error:
             self._give_up(error)
-        except Exception as error:
+        except BaseException as error:
             self._give_up(UnexpectedError(error))
 
     def _for_viewers(self, recorder: Recorder) -> None:
         cell = self._cell
         try:
             scene = describe_scene(cell.plan)
-        except Exception:
+        except BaseException:
             # A scene or a driver of a plug-in that cannot be drawn is no reason not to run.
             logger.exception("nothing is drawn in this recording")
             return
@@ -302,7 +302,7 @@ class RunRecord:
             record()
         except RecordingError as error:
             self._give_up(error)
-        except Exception:
+        except BaseException:
             logger.exception("the rest of this run is not drawn")
             self._viewers = None
 

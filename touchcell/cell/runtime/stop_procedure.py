@@ -14,6 +14,7 @@ from touchcell.control.interlocks.violation import Severity, Violation
 from touchcell.drivers.core.errors import DeviceError
 from touchcell.drivers.core.protocols import ServoArm, Stoppable
 from touchcell.drivers.core.samples import Stamped, TcpState
+from touchcell.errors import TouchcellError, described
 
 logger = logging.getLogger(__name__)
 
@@ -47,14 +48,16 @@ class StopProcedure:
         failed = self._stopper.stop(tripped=tripped, distrusted=distrusted)
         for role, error in failed.items():
             logger.error("%s could not be told to stop", role, exc_info=error)
-            self._record.event("stop failed", f"{role}: {error}")
+            self._record.event(
+                "stop failed", f"{role}: {error if isinstance(error, TouchcellError) else described(error)}"
+            )
         self._devices_deadline_ns = self._cell.clock.now_ns() + round(1e9 * DEVICE_REST_S)
         for role, device in self._cell.auxiliaries.items():
             if isinstance(device, Stoppable):
                 self._devices[role] = device
                 try:
                     call_driver(device.name, device.stop)
-                except DeviceError as error:
+                except (DeviceError, KeyboardInterrupt) as error:
                     self._record.event("stop failed", f"{role}: {error}")
 
     def await_rest(self) -> Mapping[str, StopReport]:
@@ -92,7 +95,7 @@ class StopProcedure:
         try:
             # What is on its way to rest is still guarded.
             self._cell.watchdog.beat()
-        except Exception:
+        except BaseException:
             logger.exception("the watchdog was not told that the loop lives")
 
     def _on_escalation(self, role: str, report: StopReport, waited_s: float) -> None:
@@ -108,5 +111,5 @@ def _unrest(device: Stoppable) -> str:
     """Return why a device is not known to be at rest; "" if it is."""
     try:
         return "" if device.at_rest() else "still moves"
-    except Exception as error:
-        return f"is not seen at rest ({error!r})"
+    except BaseException as error:
+        return f"is not seen at rest ({described(error)})"

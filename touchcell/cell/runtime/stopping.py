@@ -19,6 +19,7 @@ from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.errors import DeviceError
 from touchcell.drivers.core.protocols import ServoArm, StopCategory
 from touchcell.drivers.core.samples import Stamped, TcpState
+from touchcell.errors import described
 from touchcell.geometry.types import Array
 
 STOP_MARGIN_S: Final = 0.1
@@ -119,14 +120,14 @@ class Stopper:
         self._period_ns = round(1e9 * period_s)
         self._stopping: dict[str, _Stopping] = {}
 
-    def stop(self, *, tripped: bool, distrusted: Collection[str] = ()) -> Mapping[str, Exception]:
+    def stop(self, *, tripped: bool, distrusted: Collection[str] = ()) -> Mapping[str, BaseException]:
         """Command every arm to stop, whatever the drivers of others raise; returns what was raised, by role.
 
         Args:
             tripped: whether something is wrong; an arm whose work is merely done stops and holds.
             distrusted: roles of arms that can no longer be trusted and get the strongest category that they offer.
         """
-        failed: dict[str, Exception] = {}
+        failed: dict[str, BaseException] = {}
         told: dict[str, StopCategory] = {}
         for role, arm in self._arms.items():
             told[role] = StopCategory.STOP_AND_HOLD
@@ -136,7 +137,7 @@ class Stopper:
                 told[role] = self._categories.get(role, StopCategory.STOP_AND_HOLD)
             try:
                 arm.stop(told[role])
-            except Exception as error:
+            except BaseException as error:
                 # Whatever it is: the next arm has to be told now.
                 failed[role] = error
         # Measured only now: reading one arm must not delay the stop of the next.
@@ -170,14 +171,14 @@ class Stopper:
         now_ns, start, speed_m_s = self._clock.now_ns(), None, None
         try:
             limits = arm.limits
-        except Exception as error:
-            problem = f"cannot be watched, for its limits are not known: {error!r}"
+        except BaseException as error:
+            problem = f"cannot be watched, for its limits are not known: {described(error)}"
             return _Stopping(arm, category, now_ns, None, None, 0.0, 0.0, now_ns, problem=problem)
         # An arm that cannot tell its speed is given the time that its fastest motion would need.
         linear_m_s, angular_rad_s, age_s = limits.speed_m_s, limits.rot_speed_rad_s, 0.0
         try:
             sample = arm.tcp()
-        except Exception:
+        except BaseException:
             sample = None
         if sample is not None and self._tells(sample, now_ns):
             state, age_s = sample.value, max(0.0, sample.age_s(now_ns))
@@ -218,8 +219,8 @@ class Stopper:
         except DeviceError as error:
             # An arm that cannot be seen is not known to stand.
             unseen = str(error)
-        except Exception as error:
-            unseen = f"its driver raised {error!r}"
+        except BaseException as error:
+            unseen = f"its driver raised {described(error)}"
         if now_ns < stopping.deadline_ns:
             return
         if stopping.escalated:
@@ -231,7 +232,7 @@ class Stopper:
         stopping.deadline_ns = now_ns + round(1e9 * stopping.declared_s)
         on_escalation(role, stopping.report(), (now_ns - stopping.told_ns) * 1e-9)
         # It has its second deadline all the same.
-        with suppress(Exception):
+        with suppress(BaseException):
             arm.stop(_strongest(arm))
 
 
@@ -244,5 +245,5 @@ def _strongest(arm: ServoArm) -> StopCategory:
     """The strongest category that an arm offers; one that cannot be asked is commanded to stop and hold."""
     try:
         return min(arm.stop_categories)
-    except Exception:
+    except BaseException:
         return StopCategory.STOP_AND_HOLD
