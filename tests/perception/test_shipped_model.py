@@ -14,10 +14,12 @@ from touchcell.paths import MODELS
 from touchcell.perception.markers.estimator import MarkerEstimator
 from touchcell.perception.models.architecture import Architecture
 from touchcell.perception.runtime.contact_gate import ContactGate
+from touchcell.perception.runtime.estimators import load_estimator
 from touchcell.perception.runtime.inference import ContactModel
 from touchcell.simulation.render import FrameRenderer
 from touchcell.simulation.samples import Variation, contacts
 from touchcell.simulation.tip import Tip
+from touchcell.simulation.tip_file import load_tip
 
 MODEL = MODELS / "sim_gdn.safetensors"
 
@@ -90,3 +92,19 @@ def test_the_models_of_shapes_are_small_and_read_the_camera_of_the_simulation(na
 
 
 MEDIAN_ERRORS = {"sim_shape": [0.2, 0.2, 0.2, 1.5, 1.5, 0.6], "sim_edge": [1.3, 0.1, 0.15, 1.2, 1.6, 8.0]}
+
+
+def test_the_model_of_the_fitted_tip_reads_its_depth_where_another_does_not() -> None:
+    tip = load_tip("franka_tactip_1").tip
+    renderer = FrameRenderer(tip.disc_radius_px, seed=3)
+    still = Variation(0, 0, 0, 0, 0, 0)
+    frames = list(contacts(6, 7, depth_mm=(2.0, 4.0), parameters=tip, variation=still))
+    mae = {}
+    for name in ("sim_franka_tactip_1", "sim_shape"):
+        estimator = load_estimator(MODELS / f"{name}.safetensors")
+        assert estimator.reference is not None
+        read = [estimator.predict(renderer.raw(contact.pixels, i)) for i, contact in enumerate(frames)]
+        truth = [se3.to_euler_mm_deg(contact.T_f_s)[2] for contact in frames]
+        mae[name] = np.abs([each.pose_mm_deg[2] for each in read] - np.array(truth)).mean()
+    assert mae["sim_franka_tactip_1"] < 0.15
+    assert mae["sim_shape"] > 2.0 * mae["sim_franka_tactip_1"]

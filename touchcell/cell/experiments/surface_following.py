@@ -1,8 +1,9 @@
 """Surface following (paper 5.5): a straight line over a curved ramp, and eight paths down a dome, 45 degrees apart.
 
 Each path runs with the learned estimator, on the true contact, which shows the error of control alone, and with the
-learned estimator where truth is sampled: the tip is one fitted to a real sensor, the network knows another. Errors are
-of the true contact, so an estimation error counts by its effect on the arm.
+learned estimator where truth is sampled: the tip is one fitted to a real sensor, the network knows another, or was
+adapted to it by a few labelled frames. Errors are of the true contact, so an estimation error counts by its effect on
+the arm.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import numpy as np
 
 from touchcell.cell.analysis.run_folder import RunFolder, during, rms, tilt_deg, true_contacts
 from touchcell.cell.experiments.runner import ExperimentSpec, Scale
-from touchcell.cell.experiments.shape_truth import REAL_TIP, SAMPLED, sampled_truth
+from touchcell.cell.experiments.shape_truth import REAL_TIP, REAL_TIP_MODEL, SAMPLED, sampled_truth
 from touchcell.cell.experiments.table import Column
 from touchcell.cell.experiments.trials import Finished, Trial
 
@@ -37,7 +38,12 @@ def trials(scale: Scale) -> list[Trial]:
     kinds: dict[str, dict[str, Any]] = {
         estimator: {} if section is None else {f"sensors.{SENSOR}.estimator": section}
         for estimator, section in ESTIMATORS.items()
-    } | {f"learned, {SAMPLED}": {"truth": sampled_truth(SENSOR, ARM, REAL_TIP)}}
+    }
+    truth = {"truth": sampled_truth(SENSOR, ARM, REAL_TIP)}
+    kinds |= {
+        f"learned, {SAMPLED}": truth,
+        f"adapted, {SAMPLED}": truth | {f"sensors.{SENSOR}.estimator.model": f"builtin:{REAL_TIP_MODEL}"},
+    }
     return [
         Trial(
             f"{name}_{kind.replace(',', '').replace(' ', '_')}_{seed}",
