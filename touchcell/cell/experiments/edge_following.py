@@ -220,7 +220,7 @@ SPEC = ExperimentSpec(
     ),
     draw=draw,
     notes=(
-        "2D, 3D, open: on the network's estimates; what is not named is 5D, closed and forwards",
+        "rows without a mode are 5D and closed; square, foil, bowl, star and leaf backwards",
         "done: the loop is closed. Lateral and angle RMS away from corners; largest lateral error anywhere",
     ),
 )
