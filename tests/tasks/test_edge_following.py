@@ -145,9 +145,37 @@ def test_the_bend_of_a_circle_is_one_over_its_radius() -> None:
     bend, radius_m = CurvatureEstimator(0.010), 0.050
     for i in range(30):
         angle = i * 0.001 / radius_m
-        pose = se3.from_euler_mm_deg(np.array([0.0, 0.0, 0.0, 0.0, 0.0, np.degrees(angle)]))
+        x_mm, y_mm = 50.0 * math.cos(angle), 50.0 * math.sin(angle)
+        pose = se3.from_euler_mm_deg(np.array([x_mm, y_mm, 0.0, 0.0, 0.0, np.degrees(angle)]))
         bend.update(0.001, pose, np.eye(4))
-    np.testing.assert_allclose(bend.rad_per_m(), [0.0, 0.0, 1.0 / radius_m], atol=1e-6)
+    np.testing.assert_allclose(bend.per_m(), [0.0, 1.0, 0.0, 0.0, 0.0, 1.0 / radius_m], atol=1e-3)
+
+
+def twisted(behavior: FollowEdge, lean_rad_per_m: float, tilt_deg: float = 0.0) -> np.ndarray:
+    """Return the feedforward after 20 mm along a straight edge whose face leans over more and more."""
+    T_s_e, before = se3.from_euler_mm_deg(np.array([0.0, 0.0, 0.0, 0.0, tilt_deg, 0.0])), np.eye(4)
+    for i in range(21):
+        # The edge stays in its line, 20 mm ahead of the tip's middle.
+        lean = lean_rad_per_m * 1e-3 * i
+        T = np.eye(4)
+        T[:3, :3] = se3.exp(np.array([0.0, 0.0, 0.0, 0.0, lean, 0.0]))[:3, :3]
+        T[:3, 3] = np.array([0.0, 1e-3 * i, 0.0]) - 0.020 * T[:3, 2]
+        behavior.update(0.033, before, T, T_s_e.copy())
+        before = T
+    return np.array(behavior.feedforward)
+
+
+def test_a_face_that_leans_over_takes_the_tip_across_the_edge() -> None:
+    V = twisted(FollowEdge(EdgeFollowingConfig()), lean_rad_per_m=20.0)
+    np.testing.assert_allclose(V, [-0.020 * 0.6, 0.030, 0.0, 0.0, 0.6, 0.0], atol=2e-3)
+
+
+def test_a_tip_goes_slower_where_a_face_leans_over_fast_and_while_it_is_tilted() -> None:
+    fast = twisted(FollowEdge(EdgeFollowingConfig(max_turn_deg_s=60.0)), lean_rad_per_m=40.0)
+    assert fast[1] == pytest.approx(0.6 * math.radians(60.0) / 40.0, rel=0.02)
+    assert twisted(FollowEdge(EdgeFollowingConfig()), 0.0, tilt_deg=2.5)[1] == pytest.approx(0.015, rel=0.01)
+    # In three dimensions nobody tilts it back.
+    assert twisted(FollowEdge(EdgeFollowingConfig(dimensions=3)), 0.0, tilt_deg=2.5)[1] == pytest.approx(0.030)
 
 
 def test_a_mesh_is_followed_like_its_closed_form(tmp_path: Path) -> None:

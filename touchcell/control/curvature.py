@@ -1,4 +1,4 @@
-"""Curvature of what is followed: the turn of the contact frame per distance, estimated over the last stretch of it.
+"""Curvature of what is followed: the motion of the contact frame per distance, estimated over the last stretch of it.
 
 It is the feedforward of turning: a servo alone lags behind a surface that bends by speed times curvature over its gain.
 """
@@ -20,7 +20,7 @@ _CORNER_RAD: Final = math.radians(12.0)
 
 
 class CurvatureEstimator:
-    """Least-squares turn per distance over the last stretch of the way.
+    """Least-squares motion of the contact frame per distance over the last stretch of the way.
 
     Args:
         window_m: length of that stretch.
@@ -30,8 +30,8 @@ class CurvatureEstimator:
         self._window_m = window_m
         self._samples: deque[tuple[float, Array]] = deque()
         self._way_m = 0.0
-        self._turned = np.zeros(3)
-        self._R_base_f: Array | None = None
+        self._moved = np.zeros(6)
+        self._T_base_f: Array | None = None
         self._newest: Array | None = None
 
     def update(self, step_m: float, T_base_sensor: Array, T_s_f: Array | None) -> None:
@@ -40,26 +40,27 @@ class CurvatureEstimator:
         if T_s_f is None or T_s_f is self._newest:
             return
         self._newest = T_s_f
-        R_base_f = T_base_sensor[:3, :3] @ T_s_f[:3, :3]
-        if self._R_base_f is not None:
-            relative = np.eye(4)
-            relative[:3, :3] = self._R_base_f.T @ R_base_f
-            turn = se3.log(relative)[3:]
-            if float(np.linalg.norm(turn)) > _CORNER_RAD:
+        T_base_f = se3.compose(T_base_sensor, T_s_f)
+        if self._T_base_f is not None:
+            moved = se3.log(se3.compose(se3.inverse(self._T_base_f), T_base_f))
+            if float(np.linalg.norm(moved[3:])) > _CORNER_RAD:
                 self._samples.clear()
-            self._turned = self._turned + turn
-        self._R_base_f = R_base_f
-        self._samples.append((self._way_m, self._turned))
+            self._moved = self._moved + moved
+        self._T_base_f = T_base_f
+        self._samples.append((self._way_m, self._moved))
         while self._samples and self._way_m - self._samples[0][0] > self._window_m:
             self._samples.popleft()
 
-    def rad_per_m(self) -> Array:
-        """Return the turn (3,) about the axes of the contact frame per metre; zero until enough has been felt."""
+    def per_m(self) -> Array:
+        """Return the motion (6,) of the contact frame along and about its own axes per metre, 1 and rad/m.
+
+        Zero until enough has been felt.
+        """
         if len(self._samples) < _FEWEST:
-            return np.zeros(3)
+            return np.zeros(6)
         way = np.array([each for each, _ in self._samples])
-        turned = np.stack([each for _, each in self._samples])
+        moved = np.stack([each for _, each in self._samples])
         off = way - way.mean()
         spread = float(off @ off)
-        slope: Array = off @ (turned - turned.mean(axis=0)) / spread if spread > 1e-12 else np.zeros(3)
+        slope: Array = off @ (moved - moved.mean(axis=0)) / spread if spread > 1e-12 else np.zeros(6)
         return slope

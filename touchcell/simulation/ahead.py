@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Final
 
 import numpy as np
 
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
+from touchcell.geometry.vectors import cross
+from touchcell.simulation.edges import nearest_edge
 from touchcell.simulation.surfaces import Surface
 
 _TOUCHING_M: Final = 0.05e-3
@@ -18,6 +20,17 @@ _LONGEST_STEP: Final = 0.25
 _STEEP_RAD: Final = math.radians(20.0)
 _STEP_M: Final = 4e-3
 _TINY: Final = 1e-12
+_START_M: Final = 5e-3
+"""The gap at a start that is advised."""
+_TURNED_M: Final = 1e-3
+"""What turning about a contact may take of it."""
+_FARTHEST_M: Final = 0.5
+_INSIDE_M: Final = (0.0, 5e-3, 15e-3, 30e-3)
+"""How far beyond the nearest point a start is moved across its axis: the nearest point may be on a silhouette."""
+_INSIDE_EDGE_M: Final = 8e-3
+_BEYOND_EDGE_M: Final = 5e-3
+_MOST_TURN_RAD: Final = math.radians(60.0)
+_AT_EDGE_MM_DEG: Final = np.array([-2.0, 0.0, -5.0, 0.0, 0.0, 0.0])
 _FAR: Final = 4.0
 """How much further than the reach is searched, to say how far away the surface is."""
 
@@ -51,6 +64,108 @@ def remark_on_approach(
         f"no surface lies ahead of the tip; it would pass {closest[1]} at {1e3 * closest[0]:.0f} mm, "
         f"whose nearest point is ({at}) mm"
     )
+
+
+def remark_on_edge(surfaces: Sequence[Surface], T_world_s: Array, tip_radius_m: float, reach_m: float) -> str | None:
+    """Return why the first contact is not one with an edge to follow; None where it is, or there is no contact."""
+    met = _contact_pose(surfaces, T_world_s, tip_radius_m, reach_m)
+    if met is None:
+        return None
+    T_world_e = nearest_edge(surfaces, met, 0.0, tip_radius_m)
+    if T_world_e is None:
+        return None
+    T_e_s = se3.compose(se3.inverse(T_world_e), met)
+    beyond_m, turn = float(T_e_s[0, 3]), math.atan2(T_e_s[1, 0], T_e_s[0, 0])
+    if not -_INSIDE_EDGE_M <= beyond_m <= _BEYOND_EDGE_M:
+        where = "inside" if beyond_m < 0.0 else "beyond"
+        return f"the tip comes down {1e3 * abs(beyond_m):.0f} mm {where} the nearest edge"
+    if abs(turn) > _MOST_TURN_RAD:
+        return (
+            f"the tip comes down on an edge with its x axis turned by {math.degrees(turn):.0f} deg from the way across "
+            "it, away from the face"
+        )
+    return None
+
+
+def start_near(
+    surfaces: Mapping[str, Surface], T_world_s: Array, tip_radius_m: float, reach_m: float, *, on_edge: bool = False
+) -> Array | None:
+    """Return the pose (4, 4) of a sensor, near that of a start, from which it comes upon a surface.
+
+    The start is moved along its axis or across it, as little as is needed, and turned towards the surface where that
+    does not do. None where there is nothing to mend, or no such pose is found.
+
+    Args:
+        surfaces: by name.
+        T_world_s: (4, 4) pose of the sensor at the start.
+        tip_radius_m: radius of the tip.
+        reach_m: distance within which it has to make contact.
+        on_edge: it shall come down on an edge, with its x axis across it and away from the face.
+    """
+    bodies = list(surfaces.values())
+
+    def is_good(T: Array) -> bool:
+        if remark_on_approach(surfaces, T, tip_radius_m, reach_m) is not None:
+            return False
+        return not on_edge or remark_on_edge(bodies, T, tip_radius_m, reach_m) is None
+
+    if is_good(T_world_s):
+        return None
+    for T in _other_starts(surfaces, T_world_s, tip_radius_m):
+        if on_edge:
+            near = _contact_pose(bodies, T, tip_radius_m, reach_m)
+            T_world_e = None if near is None else nearest_edge(bodies, near, 0.0, tip_radius_m)
+            if T_world_e is None:
+                continue
+            T = se3.compose(T_world_e, se3.from_euler_mm_deg(_AT_EDGE_MM_DEG))
+        if is_good(T):
+            return T
+    return None
+
+
+def _other_starts(surfaces: Mapping[str, Surface], T_world_s: Array, tip_radius_m: float) -> Iterator[Array]:
+    """Yield poses 5 mm over a surface: along the axis of a start, across it, and along the normal."""
+    centre, axis = T_world_s[:3, 3], T_world_s[:3, 2]
+    bodies, high_m = list(surfaces.values()), tip_radius_m + _START_M
+    back = centre - _FARTHEST_M * axis
+    met = first_contact(bodies, back, axis, high_m, 2.0 * _FARTHEST_M)
+    if met is not None:
+        yield _at(T_world_s[:3, :3], met[0])
+        yield _at(_turned(T_world_s[:3, :3], met[1]), met[0] + _TURNED_M * met[1])
+    _, _, normal, point = _nearest(surfaces, centre, tip_radius_m)
+    aside = point - centre
+    aside = aside - float(aside @ axis) * axis
+    length_m = float(np.linalg.norm(aside))
+    for inside_m in _INSIDE_M if length_m > _TINY else ():
+        there = back + (1.0 + inside_m / length_m) * aside
+        met = first_contact(bodies, there, axis, high_m, 2.0 * _FARTHEST_M)
+        if met is not None:
+            yield _at(T_world_s[:3, :3], met[0])
+            yield _at(_turned(T_world_s[:3, :3], met[1]), met[0] + _TURNED_M * met[1])
+    yield _at(_turned(T_world_s[:3, :3], normal), point + high_m * normal)
+
+
+def _contact_pose(surfaces: Sequence[Surface], T_world_s: Array, tip_radius_m: float, reach_m: float) -> Array | None:
+    """Return the pose (4, 4) in which a tip that goes along its axis first touches, turned to what it touches."""
+    met = first_contact(surfaces, T_world_s[:3, 3], T_world_s[:3, 2], tip_radius_m, reach_m)
+    return None if met is None else _at(_turned(T_world_s[:3, :3], met[1]), met[0])
+
+
+def _at(R: Array, p: Array) -> Array:
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R, p
+    return T
+
+
+def _turned(R: Array, normal: Array) -> Array:
+    """Return axes (3, 3) turned by the smallest rotation that brings their z axis against a normal (3,)."""
+    turn = cross(R[:, 2], -normal)
+    sin = float(np.linalg.norm(turn))
+    if sin <= _TINY:
+        return R
+    angle = math.atan2(sin, -float(normal @ R[:, 2]))
+    turned: Array = se3.exp(np.concatenate([np.zeros(3), angle / sin * turn]))[:3, :3] @ R
+    return turned
 
 
 def way_over(
@@ -102,12 +217,7 @@ def points_over(
     if met is None:
         return None
     origin, normal = met
-    # The sensor turns to the surface by the smallest rotation.
-    turn = np.cross(T_world_s[:3, 2], -normal)
-    R = T_world_s[:3, :3]
-    if (sin := float(np.linalg.norm(turn))) > _TINY:
-        angle = math.atan2(sin, -float(normal @ T_world_s[:3, 2]))
-        R = se3.exp(np.concatenate([np.zeros(3), angle / sin * turn]))[:3, :3] @ R
+    R = _turned(T_world_s[:3, :3], normal)
     found = []
     for x, y in points:
         place = origin + R[:, :2] @ np.array([x, y])

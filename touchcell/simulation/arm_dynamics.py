@@ -17,7 +17,8 @@ import numpy as np
 
 from touchcell.drivers.kinematics.chain import ChainDescription, Tool
 from touchcell.geometry.types import Array
-from touchcell.simulation.dynamics_model import cross, quaternion
+from touchcell.geometry.vectors import cross
+from touchcell.simulation.dynamics_model import quaternion
 
 _ROD_RADIUS_M = 0.05
 _ROTOR_KG_M2 = 0.1

@@ -24,8 +24,9 @@ from touchcell.drivers.core.scene import ContactState
 from touchcell.errors import ConfigError, TouchcellError
 from touchcell.geometry.surface_point import SurfacePoint
 from touchcell.geometry.types import Array
+from touchcell.geometry.vectors import cross
 from touchcell.simulation.contact import about_z, tilt_of
-from touchcell.simulation.dynamics_model import TipMechanics, build_model, cross, quaternion, rotation
+from touchcell.simulation.dynamics_model import TipMechanics, build_model, quaternion, rotation
 from touchcell.simulation.objects import FreeObject
 from touchcell.simulation.solids import shape_of
 from touchcell.simulation.surfaces import Surface

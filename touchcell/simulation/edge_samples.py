@@ -16,6 +16,7 @@ import numpy as np
 
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
+from touchcell.geometry.vectors import cross
 from touchcell.simulation.contact import ContactLaw, about_z
 from touchcell.simulation.edges import nearest_edge
 from touchcell.simulation.meshes.mesh_shape import MeshShape
@@ -27,7 +28,9 @@ from touchcell.simulation.tip import Tip, TipParameters
 
 _IMAGES_PER_TIP: Final = 32
 _CREASE_RAD: Final = math.radians(30.0)
-_NEAR_CORNER: Final = 0.3
+_SPREADS: Final = (None, 0.2, 0.07)
+"""Of the ranges, by which a third of the contacts each is scattered about the middle."""
+_NEAR_CORNER: Final = 0.35
 _CORNER_RAD: Final = math.radians(15.0)
 _ALONG: Final = 0.5
 _ALONG_MM: Final = 0.1
@@ -36,7 +39,7 @@ _ALONG_MM: Final = 0.1
 
 @dataclass(frozen=True, slots=True)
 class EdgeRanges:
-    """From where contacts are drawn: half of them evenly, half about the middle, where a controller holds them.
+    """From where contacts are drawn: evenly, about the middle, and close to it, where a controller holds them.
 
     Attributes:
         offset_mm: of the tip across the edge, to either side.
@@ -50,7 +53,7 @@ class EdgeRanges:
 
     offset_mm: float = 8.0
     depth_mm: tuple[float, float] = (0.2, 7.0)
-    tilt_deg: float = 12.0
+    tilt_deg: float = 25.0
     turn_deg: float = 75.0
     shear_mm: float = 6.0
     torsion_deg: float = 8.0
@@ -59,7 +62,8 @@ class EdgeRanges:
         """Return a random contact (6,) mm and deg."""
         low, high = self.depth_mm
         most = np.array([self.offset_mm, 0.5 * (high - low), self.tilt_deg, self.tilt_deg, self.turn_deg])
-        share = rng.uniform(-1.0, 1.0, 5) if rng.random() < 0.5 else np.clip(rng.normal(0.0, 0.25, 5), -1.0, 1.0)
+        spread = _SPREADS[rng.integers(len(_SPREADS))]
+        share = rng.uniform(-1.0, 1.0, 5) if spread is None else np.clip(rng.normal(0.0, spread, 5), -1.0, 1.0)
         offset, depth, alpha, beta, turn = share * most
         return np.array([offset, 0.0, depth + 0.5 * (low + high), alpha, beta, turn])
 
@@ -137,9 +141,9 @@ def frame_on_rim(
 
 
 def _with_z(z: Array) -> Array:
-    x = np.cross([0.0, 1.0, 0.0], z)
+    x = cross(np.array([0.0, 1.0, 0.0]), z)
     x /= np.linalg.norm(x)
-    return np.stack([x, np.cross(z, x), z], axis=1)
+    return np.stack([x, cross(z, x), z], axis=1)
 
 
 def dragged_to(T_world_e: Array, T_world_s: Array, ranges: EdgeRanges, rng: np.random.Generator) -> Array:

@@ -8,6 +8,7 @@ from typing import Final, Protocol, runtime_checkable
 import numpy as np
 
 from touchcell.geometry.types import Array
+from touchcell.geometry.vectors import cross
 from touchcell.simulation.meshes.creases import EdgePoint, Polylines
 from touchcell.simulation.surfaces import Surface
 
@@ -52,7 +53,7 @@ def _frame(found: EdgePoint, apex: Array, axis: Array, tip_radius_m: float) -> A
     over = int(found.normals[1] @ axis < found.normals[0] @ axis)
     normal = found.normals[over]
     # Faces lie to the left of their own edges; the second face has the edge the other way round.
-    out = np.cross(found.tangent, normal) * (1.0 if over == 0 else -1.0)
+    out = cross(found.tangent, normal) * (1.0 if over == 0 else -1.0)
     if found.outwards is not None:
         off = apex - found.point
         off = off - float(off @ normal) * normal
@@ -61,6 +62,6 @@ def _frame(found: EdgePoint, apex: Array, axis: Array, tip_radius_m: float) -> A
             out = off / length * (1.0 if off @ found.outwards >= 0.0 else -1.0)
     out = out / np.linalg.norm(out)
     T = np.eye(4)
-    T[:3, 0], T[:3, 1], T[:3, 2] = out, np.cross(-normal, out), -normal
+    T[:3, 0], T[:3, 1], T[:3, 2] = out, cross(-normal, out), -normal
     T[:3, 3] = found.point + tip_radius_m * normal
     return T

@@ -44,7 +44,7 @@ class MeshSurfaceConfig(SurfaceConfig):
 
     def shape(self) -> MeshShape:
         """Return the shape in its own frame. Raises ConfigError."""
-        return MeshShape(self.mesh(), math.radians(self.crease_deg))
+        return _shaped(self.mesh(), math.radians(self.crease_deg))
 
     def problems(self) -> Iterable[ConfigError]:
         """Yield what is wrong with its files and solids."""
@@ -101,6 +101,12 @@ class MeshConfig(MeshSurfaceConfig):
     def modules(self) -> Mapping[str, str]:
         """Return the mesh library."""
         return _LIBRARIES
+
+
+@lru_cache(maxsize=2)
+def _shaped(mesh: TriangleMesh, crease_rad: float) -> MeshShape:
+    """Build the search once for what check asks of a mesh."""
+    return MeshShape(mesh, crease_rad)
 
 
 @lru_cache(maxsize=16)

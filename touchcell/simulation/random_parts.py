@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Final
 
 import numpy as np
@@ -12,37 +13,41 @@ from touchcell.simulation.meshes.primitives import grid_faces
 from touchcell.simulation.meshes.smoothing import TriangleMesh
 
 _WALL_M: Final = 25e-3
-_INWARDS: Final = (1.0, 0.96, 0.9, 0.8, 0.65, 0.45, 0.2)
-_OUTWARDS_M: Final = (0.0, 3e-3, 8e-3, 15e-3, 25e-3, 40e-3)
-_BLUNTEST_RAD: Final = math.radians(45.0)
+_INWARDS_M: Final = (0.0, 2e-3, 5e-3, 9e-3, 14e-3, 20e-3, 28e-3, 40e-3)
+_OUTWARDS_M: Final = (0.0, 2e-3, 5e-3, 9e-3, 14e-3, 20e-3, 28e-3, 40e-3)
+_INNERMOST: Final = 0.15
+_BLUNTEST_RAD: Final = math.radians(50.0)
+_SHARPEST_RAD: Final = math.radians(35.0)
 _NARROWEST: Final = 0.15
 """Size of a part's foot, as a share of its face."""
-_SHARPEST_CURVATURE_PER_M: Final = 30.0
+_SHARPEST_CURVATURE_PER_M: Final = 36.0
+_STEEPEST_WAVE: Final = 0.35
+_WAVES_PER_M: Final = (45.0, 130.0)
 
 
 def random_part(rng: np.random.Generator) -> TriangleMesh:
     """Return a part whose rim is an edge between a face above and a wall below; its face looks towards +z.
 
-    Half of the faces are flat, the others bend both ways with radii down to 33 mm. Two in five walls lean, by up to
-    45 deg. Outlines are circles, waves round a circle, drops with one sharp end and polygons, stars among them; a
-    quarter are the rims of holes.
+    A third of the faces are flat, the others bend both ways or are waves, with radii down to 28 mm. Half of the walls
+    lean, more of them as a bowl's do. Outlines are circles, waves round a circle, drops with one sharp end, polygons
+    and stars; three in ten are the rims of holes.
     """
-    hole = bool(rng.random() < 0.25)
+    hole = bool(rng.random() < 0.3)
     outline = _outline(rng, hole=hole)
-    curvature = rng.uniform(-_SHARPEST_CURVATURE_PER_M, _SHARPEST_CURVATURE_PER_M, 2) * (rng.random() < 0.5)
-    turn = rng.uniform(0.0, math.pi)
+    heights = _random_heights(rng)
     # Walls that lean under the face are as sharp as those of thin plates; blunt ones are those of bowls.
-    lean = rng.uniform(-_BLUNTEST_RAD, _BLUNTEST_RAD) * (rng.random() < 0.4)
+    lean = rng.uniform(-_BLUNTEST_RAD, _SHARPEST_RAD) * (rng.random() < 0.5)
     length = np.linalg.norm(outline, axis=1, keepdims=True)
     middle = outline[rng.integers(len(outline))]
     if hole:
         rings = np.stack([outline * (1.0 + away / length) for away in _OUTWARDS_M])
         wall = outline * np.maximum(1.0 + math.tan(lean) * _WALL_M / length, _NARROWEST)
     else:
-        rings = np.stack([outline * share for share in _INWARDS])
+        shares = 1.0 - np.array(_INWARDS_M) / max(float(length.max()), _INWARDS_M[-1] / (1.0 - _INNERMOST))
+        rings = outline * shares[:, None, None]
         wall = outline * np.maximum(1.0 - math.tan(lean) * _WALL_M / length, _NARROWEST)
     # Bent about a point of the rim, so that it stays a height over the plane however large the part is.
-    face = np.concatenate([rings, _heights(rings - middle, curvature, turn)[..., None]], axis=2)
+    face = np.concatenate([rings, heights(rings - middle)[..., None]], axis=2)
     foot = np.concatenate([wall, face[0, :, 2:] - _WALL_M], axis=1)
     count, rows = len(outline), len(face) + 1
     vertices = np.concatenate([foot[None], face]).reshape(-1, 3)
@@ -50,7 +55,7 @@ def random_part(rng: np.random.Generator) -> TriangleMesh:
     if hole:
         return TriangleMesh(vertices, np.ascontiguousarray(faces[:, ::-1]))
     here, there = np.arange(count), (np.arange(count) + 1) % count
-    centre_z = float(_heights(-middle, curvature, turn))
+    centre_z = float(heights(-middle))
     vertices = np.concatenate([vertices, [[0.0, 0.0, centre_z]]])
     last = (rows - 1) * count
     lid = np.stack([np.full(count, len(vertices) - 1), last + here, last + there], axis=1)
@@ -71,12 +76,27 @@ def _outline(rng: np.random.Generator, *, hole: bool) -> Array:
         most = min((mean / smallest - 1.0) / (waves**2 + 1.0), 0.25)
         radius = mean * (1.0 + rng.uniform(0.0, max(most, 0.0)) * np.cos(waves * angle + rng.uniform(0.0, 6.3)))
         return np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+    if kind > 0.8:
+        return _star(rng, smallest)
     corners = int(rng.integers(3, 9))
     angle = (np.arange(corners) + rng.uniform(-0.25, 0.25, corners)) * 2.0 * math.pi / corners
-    mean = rng.uniform(1.5 * smallest, 0.12) if kind < 0.85 else 0.2
+    mean = rng.uniform(1.5 * smallest, 0.12) if kind < 0.74 else 0.2
     radius = mean * rng.uniform(0.7 if corners > 4 else 0.85, 1.0, corners)
+    return _sides(radius, angle)
+
+
+def _star(rng: np.random.Generator, smallest: float) -> Array:
+    """Return an outline (n, 2) m whose corners point outwards and inwards by turns."""
+    points = int(rng.integers(2, 7))
+    angle = (np.arange(2 * points) + rng.uniform(-0.2, 0.2, 2 * points)) * math.pi / points
+    mean = rng.uniform(2.0 * smallest, 0.1)
+    return _sides(mean * np.where(np.arange(2 * points) % 2, rng.uniform(0.5, 0.85), 1.0), angle)
+
+
+def _sides(radius: Array, angle: Array) -> Array:
+    """Return points (n, 2) m along the straight sides between corners in polar coordinates."""
     points = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
-    share = np.linspace(0.0, 1.0, 240 // corners, endpoint=False)[:, None]
+    share = np.linspace(0.0, 1.0, 240 // len(points), endpoint=False)[:, None]
     return np.concatenate(
         [(1.0 - share) * a + share * b for a, b in zip(points, np.roll(points, -1, axis=0), strict=True)]
     )
@@ -94,11 +114,26 @@ def _drop(rng: np.random.Generator) -> Array:
     return drop
 
 
-def _heights(points: Array, curvature: Array, turn: float) -> Array:
-    sin, cos = math.sin(turn), math.cos(turn)
-    x, y = cos * points[..., 0] + sin * points[..., 1], cos * points[..., 1] - sin * points[..., 0]
-    heights: Array = 0.5 * (_bounded(x) * curvature[0] + _bounded(y) * curvature[1])
-    return heights
+def _random_heights(rng: np.random.Generator) -> Callable[[Array], Array]:
+    """Return a function of points (..., 2) m that gives the height (...) m of a face over the plane at each."""
+    kind, turns = rng.random(), rng.uniform(0.0, math.pi, 2)
+    if kind < 0.35:
+        return lambda points: np.zeros(points.shape[:-1])
+    if kind < 0.65:
+        # Two bends across each other.
+        curvature = rng.uniform(-_SHARPEST_CURVATURE_PER_M, _SHARPEST_CURVATURE_PER_M, 2)
+        ways = _directions(turns[0] + np.array([0.0, 0.5 * math.pi]))
+        return lambda points: 0.5 * _bounded(points @ ways) @ curvature
+    per_m = rng.uniform(*_WAVES_PER_M, 2)
+    highest_m = np.minimum(0.5 * _SHARPEST_CURVATURE_PER_M / per_m**2, 0.5 * _STEEPEST_WAVE / per_m)
+    amplitude_m, phase = rng.uniform(0.0, 2.0, 2) * highest_m, rng.uniform(0.0, 2.0 * math.pi, 2)
+    waves = per_m * _directions(turns)
+    return lambda points: np.cos(points @ waves + phase) @ amplitude_m
+
+
+def _directions(angles: Array) -> Array:
+    """Return (2, n): a unit vector in the plane for each angle."""
+    return np.stack([np.cos(angles), np.sin(angles)])
 
 
 def _bounded(x: Array) -> Array:

@@ -21,7 +21,14 @@ from touchcell.errors import ConfigError, TouchcellError
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 from touchcell.plugin_section import Section
-from touchcell.simulation.ahead import first_contact, points_over, remark_on_approach, way_over
+from touchcell.simulation.ahead import (
+    first_contact,
+    points_over,
+    remark_on_approach,
+    remark_on_edge,
+    start_near,
+    way_over,
+)
 from touchcell.simulation.bodies import scene_bodies
 from touchcell.simulation.closed_forms import Box, Cylinder, Saddle
 from touchcell.simulation.contact import ContactLaw
@@ -561,6 +568,17 @@ class SceneConfig(Section, SceneSection):
         for sensor, T_world_s in starts.items():
             if ahead := remark_on_approach(surfaces, T_world_s, radius_m, reach_m):
                 yield f"sensors.{sensor}: {ahead}"
+
+    def start_near(self, T_world_s: Array, reach_m: float, *, on_edge: bool = False) -> Array | None:
+        """Return a start near one that does not come upon a surface that stands still, or upon its edge."""
+        surfaces = {name: surface.build() for name, surface in self.surfaces.items()}
+        if self.objects or not all(isinstance(surface.motion, Still) for surface in surfaces.values()):
+            return None
+        return start_near(surfaces, T_world_s, 1e-3 * self.tip.radius_mm, reach_m, on_edge=on_edge)
+
+    def edge_missed(self, T_world_s: Array, reach_m: float) -> str:
+        """Return why the first contact with surfaces that stand still is not one with an edge."""
+        return remark_on_edge(self._still(), T_world_s, 1e-3 * self.tip.radius_mm, reach_m) or ""
 
     def _still(self) -> Sequence[Surface]:
         """Return the surfaces of a scene in which nothing moves; none of any other."""

@@ -20,6 +20,7 @@ from touchcell.geometry.types import Array
 from touchcell.perception.features.feature_model import TouchedFeature
 from touchcell.perception.runtime.feature_spec import EDGE
 from touchcell.tasks.contact_servo import ContactServo, SixGains
+from touchcell.tasks.felt_curvature import slower_by_tilt
 from touchcell.tasks.interface import DEPTH, SPEED, TaskContext, TaskSpec
 from touchcell.tasks.servoing import ARM, SENSOR, ServoConfig, ServoTask, servo_motions
 
@@ -35,8 +36,8 @@ _BEND_SHARE: Final = 0.6
 """Of the largest turn that a bend may take, so that corrections have the rest."""
 _NO_EDGE_S: Final = 0.1
 """Without an edge before anything is followed: three frames, before the controller goes where it seems to be."""
-_FASTEST_TILT_RAD_S: Final = 1.0
-"""Of the tilt that is fed forward."""
+_STILL_RAD: Final = math.radians(45.0)
+"""The turn still to make at which the tip turns on the spot."""
 
 
 class EdgeFollowingConfig(ServoConfig):
@@ -130,7 +131,7 @@ class FollowEdge:
         """Add up the way along the edge; return True once it is long enough, or its loop is closed.
 
         Where the edge leads far from where the sensor heads, as at a corner, it turns before it goes on; in a bend it
-        goes no faster than it can turn.
+        goes no faster than it can turn, and slower while it is tilted against the face.
         """
         if self._start is None:
             self._start = now[:3, 3].copy()
@@ -139,14 +140,18 @@ class FollowEdge:
         self._turn_bend.update(float(step[1]), now, T_s_f)
         self._tilt_bend.update(float(step[1]), now, T_s_f)
         turn = 0.0 if T_s_f is None else math.atan2(T_s_f[1, 0], T_s_f[0, 0])
-        bend = float(self._turn_bend.rad_per_m()[2])
-        speed = min(self._speed_m_s, _BEND_SHARE * self._fastest_rad_s / max(abs(bend), 1e-9))
-        speed *= max(math.cos(min(2.0 * abs(turn), math.pi / 2.0)), 0.0)
-        self._feedforward[1] = self._sign * speed
-        self._feedforward[5] = speed * bend
+        bend = np.zeros(6)
+        bend[5] = self._turn_bend.per_m()[5]
         if self._tilts:
-            tilt = speed * self._tilt_bend.rad_per_m()[:2]
-            self._feedforward[3:5] = np.clip(tilt, -_FASTEST_TILT_RAD_S, _FASTEST_TILT_RAD_S)
+            # A face that leans over more and more takes the middle of the tip across the edge with it.
+            tilting = self._tilt_bend.per_m()
+            bend[[0, 3, 4]] = tilting[[0, 3, 4]]
+        speed = min(self._speed_m_s, _BEND_SHARE * self._fastest_rad_s / max(float(np.linalg.norm(bend[3:])), 1e-9))
+        speed *= max(math.cos(min(abs(turn) / _STILL_RAD, 1.0) * 0.5 * math.pi), 0.0)
+        if self._tilts and T_s_f is not None:
+            speed *= slower_by_tilt(T_s_f)
+        self._feedforward = speed * bend
+        self._feedforward[1] = self._sign * speed
         if self._close_loop:
             from_start = float(np.linalg.norm(now[:3, 3] - self._start))
             self._away = self._away or from_start > 3.0 * self._closing_m

@@ -106,14 +106,18 @@ class CurvedWay:
         The speed falls where the surface turns faster than the sensor may, and with a tilt that is not yet corrected.
         """
         R = T_base_sensor[:3, :3]
-        normal, tilt = R[:, 2], 0.0
+        normal, slower = R[:, 2], 1.0
         if T_s_f is not None:
-            normal = R @ T_s_f[:3, 2]
-            tilt = math.acos(min(max(float(T_s_f[2, 2]), -1.0), 1.0))
+            normal, slower = R @ T_s_f[:3, 2], slower_by_tilt(T_s_f)
             self._curvature.update(T_base_sensor[:3, 3], normal)
         turn = R.T @ self._curvature.turn_rad_per_m(R @ direction, normal)
         bend = float(np.linalg.norm(turn))
-        slower = 1.0 / (1.0 + (tilt / _HALF_SPEED_RAD) ** 3)
         self.speed_m_s = min(slower * self._speed_m_s, _SHARE * self._fastest_rad_s / max(bend, 1e-9))
         self.twist = self.speed_m_s * np.concatenate([direction, turn])
         return self.twist
+
+
+def slower_by_tilt(T_s_f: Array) -> float:
+    """Return the share of the speed that a sensor may have while it is tilted against a contact (4, 4)."""
+    tilt = math.acos(min(max(float(T_s_f[2, 2]), -1.0), 1.0))
+    return 1.0 / (1.0 + (tilt / _HALF_SPEED_RAD) ** 3)

@@ -203,3 +203,23 @@ def test_a_corner_of_a_rim_is_as_far_away_as_it_is_from_wherever_it_is_seen(
             vertices = cup.drawn().vertices
             found = cup.nearest(p)
             assert found.distance_m == pytest.approx(np.linalg.norm(vertices - p, axis=1).min(), abs=2e-3)
+
+
+@pytest.mark.parametrize("uneven", [False, True])
+def test_normals_on_a_rim_are_those_of_the_surface(uneven: bool) -> None:
+    # The cut of a saddle by a cylinder: rings of its face, and a wall below.
+    rng = np.random.default_rng(4)
+    angle = np.arange(84) * 2.0 * math.pi / 84
+    rings = []
+    for i in range(8):
+        at = angle + (rng.uniform(-0.01, 0.01, 84) if uneven and i else 0.02 * i)
+        x, y = (0.045 - 0.0034 * i) * np.cos(at), (0.045 - 0.0034 * i) * np.sin(at)
+        rings.append(np.stack([x, y, x**2 / 0.24 - y**2 / 0.18], axis=1))
+    foot = rings[0] - [0.0, 0.0, 0.025]
+    mesh = smooth(TriangleMesh(np.concatenate([foot, *rings]), primitives.grid_faces(9, 84, closed=True)), CREASE)
+    corners = mesh.mesh.vertices[mesh.mesh.faces]
+    on_rim = (np.hypot(corners[..., 0], corners[..., 1]) > 0.0449) & (mesh.mesh.face_normals()[:, None, 2] ** 2 > 1e-14)
+    true = np.stack([-corners[..., 0] / 0.12, corners[..., 1] / 0.09, np.ones(corners.shape[:2])], axis=2)
+    true /= np.linalg.norm(true, axis=2, keepdims=True)
+    cos = np.abs(np.einsum("mkc,mkc->mk", true, mesh.normals))[on_rim]
+    assert np.degrees(np.arccos(np.minimum(cos, 1.0))).max() < 0.1

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from touchcell.cell.config.demands import demands
 from touchcell.cell.config.rule_limits import is_kind, limits_of
-from touchcell.cell.config.starts import pose_of, start_of_arm
+from touchcell.cell.config.starts import pose_of, start_near, start_of_arm
 from touchcell.cell.config.yaml_file import YamlFile
 from touchcell.drivers.core.arm import LimitsConfig
 from touchcell.drivers.core.scene import scene_section
@@ -242,8 +242,9 @@ def _contacts(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
         hint = "e.g. {disc: {kind: cylinder, radius_mm: 50, height_mm: 20}}"
         yield file.problem(("scene", "surfaces"), f"no surface has an edge, which {plan.task.name} needs", hint=hint)
     for name, depth_m in pressed.items():
+        other = start_near(plan, scene, name)
         yield file.problem(
             ("arms", arms[name], "start_pose_mm_deg"),
             f"the tip of {name!r} is {1e3 * depth_m:.1f} mm deep in something there, but the task starts free",
-            hint="start farther away",
+            hint=f"start clear of it, as with {other}" if other else "start farther away",
         )

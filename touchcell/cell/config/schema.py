@@ -33,6 +33,7 @@ from touchcell.cell.config.feasibility import unfeasible
 from touchcell.cell.config.feasible_motion import failing_motions, foreseen_trips, places_outside, ways_over
 from touchcell.cell.config.input_files import with_input_files, with_paths
 from touchcell.cell.config.layers import load_layers
+from touchcell.cell.config.starts import start_near
 from touchcell.cell.config.stopping_distance import StoppingDistance, combined, overshoot
 from touchcell.cell.config.truth import SampledTruth, sample
 from touchcell.cell.config.worlds import WorldChanges, WorldName, world_changes
@@ -666,7 +667,16 @@ def _remarks_on_scene(plan: CellPlan) -> tuple[str, ...]:
         return ()
     reach_mm = getattr(plan.task_config, "approach_distance_mm", None)
     reach_m = None if reach_mm is None else 1e-3 * reach_mm
-    return tuple(scene_section().model_validate(scene).remarks(_sensor_starts(plan), reach_m))
+    section, starts = scene_section().model_validate(scene), _sensor_starts(plan)
+    remarks = list(section.remarks(starts, reach_m))
+    if reach_m is None:
+        return tuple(remarks)
+    for name, T_world_s in starts.items():
+        if plan.task.feature == "edge" and (missed := section.edge_missed(T_world_s, reach_m)):
+            remarks.append(f"sensors.{name}: {missed}")
+        if other := start_near(plan, section, name):
+            remarks.append(f"sensors.{name}: it would come upon it from {other}")
+    return tuple(remarks)
 
 
 def _sensor_starts(plan: CellPlan) -> dict[str, Array]:

@@ -12,6 +12,7 @@ from touchcell.geometry.types import Array
 
 if TYPE_CHECKING:
     from touchcell.cell.config.cell_plan import CellPlan
+    from touchcell.drivers.core.scene import SceneSection
 
 
 def start_of_arm(plan: CellPlan, arm: str) -> Array | None:
@@ -27,6 +28,26 @@ def start_of_sensor(plan: CellPlan) -> tuple[Array | None, Array]:
     sensor = plan.cell.sensors[plan.sensor_roles[min(plan.sensor_roles)]]
     start = None if sensor.mounted_on is None else start_of_arm(plan, sensor.mounted_on)
     return start, sensor.T_tcp_sensor
+
+
+def start_near(plan: CellPlan, scene: SceneSection, sensor: str) -> str:
+    """Return, for people, a start of a sensor's arm from which it comes upon what it has to touch.
+
+    Empty where the given start does, or none is known.
+    """
+    section = plan.cell.sensors[sensor]
+    reach_mm = getattr(plan.task_config, "approach_distance_mm", None)
+    arm = section.mounted_on
+    if reach_mm is None or arm is None or (start := start_of_arm(plan, arm)) is None:
+        return ""
+    T_world_base = plan.cell.arms[arm].T_world_base
+    T_world_s = T_world_base @ start @ section.T_tcp_sensor
+    found = scene.start_near(T_world_s, 1e-3 * reach_mm, on_edge=plan.task.feature == "edge")
+    if found is None:
+        return ""
+    T_base_tcp = se3.inverse(T_world_base) @ found @ se3.inverse(section.T_tcp_sensor)
+    numbers = ", ".join(f"{value:g}" for value in np.round(se3.to_euler_mm_deg(T_base_tcp), 1) + 0.0)
+    return f"arms.{arm}.start_pose_mm_deg: [{numbers}]"
 
 
 def pose_of(pose_mm_deg: Any) -> Array | None:

@@ -27,6 +27,19 @@ ESTIMATORS: Final[dict[str, dict[str, Any] | None]] = {
     "learned": None,
     "true edge with noise": {"kind": "true_edge", "noise_mm": 0.1, "noise_deg": 0.5},
 }
+MODES: Final[dict[str, tuple[str, dict[str, Any]]]] = {
+    "circle, 2D": ("circle", {"task.dimensions": 2}),
+    "square, 2D backwards": ("square", {"task.dimensions": 2, "task.direction": "backward"}),
+    "saddle, 3D": ("saddle", {"task.dimensions": 3}),
+    "bowl, 3D backwards": ("bowl", {"task.dimensions": 3, "task.direction": "backward"}),
+    "clover, 5D backwards": ("clover", {"task.direction": "backward"}),
+    "foil, 5D open": ("foil", {"task.close_loop": False, "task.distance_mm": 80.0}),
+    "ell, 5D open backwards": (
+        "ell",
+        {"task.close_loop": False, "task.distance_mm": 80.0, "task.direction": "backward"},
+    ),
+}
+"""Other ways of following than once around in five dimensions: the row's name, the shape and changes of the cell."""
 _SAMPLED: Final = ("circle", "square", "clover")
 _QUICK: Final = ("circle", "square")
 _HEIGHT_MM: Final = 20.0
@@ -123,8 +136,10 @@ def start_pose_mm_deg(name: str) -> list[float]:
 
 
 def trials(scale: Scale) -> list[Trial]:
-    """Return trials of all shapes with each estimator, half of them backwards."""
+    """Return trials of all shapes with each estimator, half of them backwards, and of the other modes."""
     shapes = _QUICK if scale.quick else SHAPES
+    rows = list(shape_rows(shapes, ESTIMATORS, _SAMPLED, sensor=SENSOR, arm="arm"))
+    modes = () if scale.quick else MODES.items()
     return [
         Trial(
             f"{name}_{row.replace(', ', '_').replace(' ', '_')}_{seed}",
@@ -141,7 +156,7 @@ def trials(scale: Scale) -> list[Trial]:
                 "seed": seed,
             },
         )
-        for name, row, changes in shape_rows(shapes, ESTIMATORS, _SAMPLED, sensor=SENSOR, arm="arm")
+        for name, row, changes in rows + [(name, mode.partition(", ")[2], changes) for mode, (name, changes) in modes]
         for seed in range(1, scale.repetitions(1) + 1)
     ]
 
@@ -204,5 +219,8 @@ SPEC = ExperimentSpec(
         Column("duration_s", "s", digits=1),
     ),
     draw=draw,
-    notes=("done: the loop is closed. Lateral and angle RMS away from corners; largest lateral error anywhere",),
+    notes=(
+        "rows without a mode are 5D and closed; square, foil, bowl, star and leaf backwards",
+        "done: the loop is closed. Lateral and angle RMS away from corners; largest lateral error anywhere",
+    ),
 )

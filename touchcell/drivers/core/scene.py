@@ -194,6 +194,22 @@ class SceneSection(BaseModel):
         """Return whether anything in it has an edge that could be followed."""
         return True
 
+    def start_near(self, T_world_s: Array, reach_m: float, *, on_edge: bool = False) -> Array | None:
+        """Return the pose (4, 4) of a sensor near that of a start, from which it comes upon something.
+
+        None where the start itself will do, or no other one is known.
+
+        Args:
+            T_world_s: (4, 4) pose of the sensor at the start.
+            reach_m: distance along its axis within which it has to make contact.
+            on_edge: whether it has to be with an edge.
+        """
+        return None
+
+    def edge_missed(self, T_world_s: Array, reach_m: float) -> str:
+        """Return why the first contact is not one with an edge to follow; empty where it is, or that is not known."""
+        return ""
+
     def remarks(self, starts: Mapping[str, Array], reach_m: float | None) -> Iterable[str]:
         """Return what a sensor cannot follow of it, in a line each.
 

@@ -116,21 +116,17 @@ def creases(smooth: SmoothMesh) -> Polylines:
 
 def _tangents(begin: Indices, finish: Indices, unit: Array, vertex_count: int) -> Array:
     """Return (k, 2, 3) the tangent at both ends of each piece: the mean of both pieces where exactly two continue."""
-    at_vertex: list[list[int]] = [[] for _ in range(vertex_count)]
-    for i, (a, b) in enumerate(zip(begin.tolist(), finish.tolist(), strict=True)):
-        at_vertex[a].append(i)
-        at_vertex[b].append(i)
     tangents = np.stack([unit, unit], axis=1)
-    for i, ends in enumerate(zip(begin.tolist(), finish.tolist(), strict=True)):
-        for which, vertex in enumerate(ends):
-            others = [each for each in at_vertex[vertex] if each != i]
-            if len(others) != 1:
-                continue
-            other = unit[others[0]]
-            # The neighbour may run the other way round.
-            leaves = vertex == begin[others[0]]
-            onwards = other if (which == 1) == bool(leaves) else -other
-            if onwards @ unit[i] >= _CORNER_COS:
-                mean = unit[i] + onwards
-                tangents[i, which] = mean / np.linalg.norm(mean)
+    at = np.stack([begin, finish], axis=1).ravel()
+    order = np.argsort(at, kind="stable")
+    first = order[np.flatnonzero(np.bincount(at, minlength=vertex_count)[at[order]] == 2)].reshape(-1, 2)
+    (one, other), (end, other_end) = (first // 2).T, (first % 2).T
+    # A neighbour may run the other way round.
+    along = np.where(end == other_end, -1.0, 1.0)[:, None] * unit[other]
+    bends_little = np.einsum("kc,kc->k", along, unit[one]) >= _CORNER_COS
+    one, other, end, other_end, along = (each[bends_little] for each in (one, other, end, other_end, along))
+    mean = unit[one] + along
+    mean /= np.linalg.norm(mean, axis=1, keepdims=True)
+    tangents[one, end] = mean
+    tangents[other, other_end] = np.where(end == other_end, -1.0, 1.0)[:, None] * mean
     return tangents
