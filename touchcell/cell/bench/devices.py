@@ -31,6 +31,7 @@ from touchcell.testing.emulation.rig import RIGS
 _RIGS = ("ur", "franka", "damiao_can", "feetech_serial", "v4l2")
 _TRIALS = 20
 _CALM_S = 0.12
+_ONSET_S = 0.3
 _TTL_S = 0.2
 _CLIENT_TIMEOUT_S = 30.0
 _COLUMNS = (
@@ -61,8 +62,8 @@ def run(arguments: Sequence[str], out: Path) -> None:
             address = 1000 + (os.getpid() % 30_000) * 16 + number
             device = DeviceUnderTest(RIGS.load(name), Path(folder), address)
             try:
-                rows[name] = _measure(device)
-                rows[f"{name}, vendor"] = _vendor(device)
+                rows[name] = _measure(name, device)
+                rows[f"{name}, vendor"] = _vendor(name, device)
             finally:
                 device.clear()
     print(f"\n{'':<24}" + "".join(f"{title:>11}" for _, title, _ in _COLUMNS))
@@ -70,15 +71,15 @@ def run(arguments: Sequence[str], out: Path) -> None:
         cells = (f"{format(row[key], form) if row.get(key) is not None else '-':>11}" for key, _, form in _COLUMNS)
         print(f"{name:<24}" + "".join(cells) + (f"  {row['error']}" if "error" in row else ""))
     print(
-        "\nwire: from send_twist to the emulator's receive stamp, always from rest. ttl, kill: from expiry or kill -9"
-        "\nuntil the tool rests, or the motors of an arm without brakes let go. frozen: until the driver is FAULTED."
+        "\nwire: from send_twist to the emulator's receive stamp, from rest; of coarse servos to a whole step."
+        "\nttl, kill: from expiry or kill -9 until the tool rests, or the motors of an arm without brakes let go."
+        "\nfrozen: until the driver is FAULTED."
     )
     out.mkdir(parents=True, exist_ok=True)
     (out / "devices.json").write_text(json.dumps({"provenance": provenance(), "rows": rows}, indent=1) + "\n")
 
 
-def _measure(device: DeviceUnderTest) -> dict[str, Any]:
-    name = device.function.__module__.rpartition(".")[2]
+def _measure(name: str, device: DeviceUnderTest) -> dict[str, Any]:
     device.emulator()
     row = _client("ours", device, name)
     for part in (_wire, _ttl, _kill, _frozen):
@@ -94,8 +95,7 @@ def _measure(device: DeviceUnderTest) -> dict[str, Any]:
     return row
 
 
-def _vendor(device: DeviceUnderTest) -> dict[str, Any]:
-    name = device.function.__module__.rpartition(".")[2]
+def _vendor(name: str, device: DeviceUnderTest) -> dict[str, Any]:
     device.emulator()
     return _client("vendor", device, name)
 
@@ -143,12 +143,16 @@ def _wire(device: DeviceUnderTest) -> dict[str, Any]:
         for trial in range(_TRIALS):
             context.sleep(_CALM_S)
             sign = 1.0 if trial % 2 else -1.0
-            command = context.command(sign * context.twist(context.axis()), ttl_s=0.04)
+            twist = sign * context.twist(context.axis())
             before_ns = time.monotonic_ns()
-            context.arm.send_twist(command, lease)
-            context.sleep(0.035)
-            onset_ns = context.truth()["command_onset_ns"]
-            if onset_ns > before_ns:
+            context.arm.send_twist(context.command(twist), lease)
+            # A servo with coarse steps is told nothing new until the motion has come to a whole one.
+            while (onset_ns := context.truth()["command_onset_ns"]) <= before_ns:
+                if time.monotonic_ns() - before_ns > _ONSET_S * 1e9:
+                    break
+                context.sleep(0.005)
+                context.arm.send_twist(context.command(twist), lease)
+            else:
                 latencies_ms.append((onset_ns - before_ns) * 1e-6)
             context.arm.stop()
             context.settle()
