@@ -15,7 +15,7 @@ _SHEAR_N_MM = 0.4
 def moments_n_mm(pushed: Pushed) -> tuple[float, float, float]:
     """Return the moments of the push, of the weight about an edge, and of the two tips."""
     weight_n = 9.81e-3 * pushed.mass_g
-    tips = _SHEAR_N_MM * sum(held_with_mm(pushed)) * pushed.reach_mm
+    tips = _SHEAR_N_MM * 2.0 * held_with_mm(pushed) * pushed.reach_mm
     return _MDF * weight_n * pushed_at_mm(pushed), weight_n * pushed.reach_mm, tips
 
 

@@ -34,12 +34,11 @@ _PRISM_MM = 200.0
 _PUSHED_AT = 0.8
 _BELOW_TOP_MM = 15.0
 _FOLLOWER_MM = 3.0
-# Each tip's fraction of the object's weight, shear stiffness of the cells' tips, and their largest shear: 80 % of what
-# sticks at _FOLLOWER_MM, and at the 2 mm that friction on the table leaves the leader before it pushes.
-_SHARE = 0.35
+# Shear stiffness of the cells' tips; the paper's shear, and the largest: more slips at _FOLLOWER_MM, and at the 2 mm that
+# friction on the table leaves the leader before it pushes. More than is needed makes both heavier to push.
 _SHEAR_N_MM = 0.4
-_LIFT_MAX_MM = 3.2
-_PRESS_MAX_MM = 2.2
+_SHEAR_MIN_MM, _SHEAR_MAX_MM = 0.5, 2.5
+_SAFETY = 1.1
 _LOST_DEG = 10.0
 _ROUND = ("cylinder", "bottle")
 # The cell's follower yields laterally but slowly, for objects with flat sides: on these its contact would drift off the
@@ -90,16 +89,20 @@ def trials(scale: Scale) -> list[Trial]:
 def _cell_changes(pushed: Pushed, arms: str) -> dict[str, Any]:
     height_mm = pushed_at_mm(pushed)
     # Both in the same world: the shipped cells differ in this.
-    # Slowly, by the paper's controller: fast pushes topple.
-    same = {"scene.step_ms": 5, "task.steering": "bearing", "task.push_speed_mm_s": 20.0}
+    # Slowly: fast pushes topple.
+    same: dict[str, Any] = {"scene.step_ms": 5, "task.push_speed_mm_s": 20.0}
+    is_round = pushed.shape["kind"] in _ROUND
+    if arms == WITHOUT or is_round:
+        # By the paper's controller: a round object rolls off the line that is predicted for it.
+        same["task.steering"] = "bearing"
     same |= _ARMS[arms].around(pushed, "mdf", height_mm)
     if arms == WITHOUT:
         return same | _boxes_up_to(height_mm, "workspace")
-    press_mm, lift_mm = held_with_mm(pushed)
-    same["task.reference_mm_deg"] = [press_mm, 0, 0, 0, 0, 0]
+    held_mm = held_with_mm(pushed)
+    same["task.reference_mm_deg"] = [held_mm, 0, 0, 0, 0, 0]
     same["task.follower.active"] = False
-    same["task.follower.reference_mm_deg"] = [-lift_mm, 0, _FOLLOWER_MM, 0, 0, 0]
-    if pushed.shape["kind"] in _ROUND:
+    same["task.follower.reference_mm_deg"] = [-held_mm, 0, _FOLLOWER_MM, 0, 0, 0]
+    if is_round:
         same |= _FOLLOWER_OF_ROUND
         held_n = _MDF * 1e-3 * pushed.mass_g * GRAVITY_M_S2
         same["task.follower.active"] = held_n < _STIFFNESS_N_MM * _FOLLOWER_MM
@@ -136,14 +139,16 @@ def pushed_at_mm(pushed: Pushed) -> float:
     return _PUSHED_AT * float(pushed.shape["size_mm"][2] if "size_mm" in pushed.shape else pushed.shape["height_mm"])
 
 
-def held_with_mm(pushed: Pushed) -> tuple[float, float]:
-    """Return the shear with which the leader presses down at its contact, and the follower lifts at its contact.
+def held_with_mm(pushed: Pushed) -> float:
+    """Return the shear with which the leader presses down at its contact, and as much lifts the follower at its own.
 
     Both create a moment against toppling. Too little and the object topples over its leading edge while it is pushed;
     too much and it topples backwards at rest.
     """
-    shear_mm = _SHARE * 1e-3 * pushed.mass_g * GRAVITY_M_S2 / _SHEAR_N_MM
-    return round(min(shear_mm, _PRESS_MAX_MM), 2), round(min(shear_mm, _LIFT_MAX_MM), 2)
+    weight_n = 1e-3 * pushed.mass_g * GRAVITY_M_S2
+    topples_n_mm = weight_n * (_MDF * pushed_at_mm(pushed) - pushed.reach_mm)
+    shear_mm = _SAFETY * topples_n_mm / (2.0 * _SHEAR_N_MM * pushed.reach_mm)
+    return round(min(max(shear_mm, _SHEAR_MIN_MM), _SHEAR_MAX_MM), 2)
 
 
 def _boxes_up_to(height_mm: float, *interlocks: str) -> dict[str, Any]:
