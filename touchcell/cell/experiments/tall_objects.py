@@ -34,8 +34,8 @@ _PRISM_MM = 200.0
 _PUSHED_AT = 0.8
 _BELOW_TOP_MM = 15.0
 _FOLLOWER_MM = 3.0
-# Shear stiffness of the cells' tips; the paper's shear, and the largest: more slips at _FOLLOWER_MM, and at the 2 mm that
-# friction on the table leaves the leader before it pushes. More than is needed makes both heavier to push.
+# Shear stiffness of the cells' tips; the paper's shear, and the largest: more slips at _FOLLOWER_MM, and at the 2 mm
+# that friction on the table leaves the leader before it pushes. More than is needed makes objects heavier to push.
 _SHEAR_N_MM = 0.4
 _SHEAR_MIN_MM, _SHEAR_MAX_MM = 0.5, 2.5
 _SAFETY = 1.1
