@@ -119,8 +119,11 @@ def track(name: str, *, moving: bool, duration_s: float, seed: int, network: Pat
     cell_file["interlocks"] = {
         k: v for k, v in cell_file["interlocks"].items() if v["kind"] in REQUIRED_OF_ARMS + REQUIRED_OF_SENSORS
     }
-    if not moving:
-        del cell_file["scene"]["surfaces"]["plate"]["motion"]
+    plate = cell_file["scene"]["surfaces"]["plate"]
+    if moving:
+        plate["motion"]["start_s"] = 0.0
+    else:
+        del plate["motion"]
     settings = FILTERS[name]
     estimator = cell_file["sensors"]["sensor"]["estimator"]
     if network is not None:

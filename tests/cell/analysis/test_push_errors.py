@@ -41,6 +41,7 @@ def test_the_summary_begins_with_the_object(tmp_path, capsys):
     assert summary["target_error_mm"] < 5.0
     printed = capsys.readouterr().out.splitlines()
     assert f"object {summary['object_error_mm']:.1f} mm from the target" in printed[1]
+    assert any("as far as object_center_offset_mm is right" in line for line in printed[2:6])
 
 
 def test_a_push_that_is_given_up_says_how_far_off_the_object_is(tmp_path, capsys):

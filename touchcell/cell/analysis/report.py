@@ -217,7 +217,6 @@ def _headline(source: RunFolder, plan: CellPlan | None) -> list[str]:
         lines = [f"{result['cell']}: {result['task']} {result['outcome']} after {float(result['duration_s']):.2f} s"]
         if result.get("reason"):
             lines.append(f"  {result['reason']}")
-        lines += [f"  as far as {each}" for each in result.get("rests_on", ())]
     else:
         name = source.path.resolve().name if plan is None else f"{plan.cell.name}: {plan.task.name}"
         lines = [f"{name} has no result after {recorded_s:.2f} s: " + _without_result(source.path)]
@@ -242,6 +241,7 @@ def _text(
     folder: Path, result: dict[str, Any], summary: dict[str, Any], pictures: Sequence[Path], run: Run
 ) -> list[str]:
     lines = [f"  {_ENDED[name].format(summary[name])}" for name in _ENDED if name in summary]
+    lines += [f"  as far as {each}" for each in result.get("rests_on", ())]
     lines += [f"  {line}" for line in summary.get("close_calls", ())]
     for sensor, kinds in summary["errors"].items():
         lines.append(f"{sensor}, error RMS    " + "".join(f"{name:>11}" for name in COMPONENTS))
