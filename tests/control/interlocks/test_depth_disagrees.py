@@ -17,6 +17,7 @@ from touchcell.control.proof import prove
 from touchcell.drivers.core.gate import TwistLimits
 from touchcell.drivers.core.samples import Stamped, TcpState
 from touchcell.geometry import se3
+from touchcell.geometry.types import Array
 
 CYCLE_NS = 10_000_000
 START_NS = 10**12
@@ -179,9 +180,8 @@ def test_a_wrench_that_is_old_or_from_the_future_is_an_error(age_ns: int, fresh:
             press(0.0, 0.0, force_n=0.0, wrench_age_ns=age_ns)
 
 
-@pytest.mark.parametrize("limits", [TwistLimits(0.02, 0.5, 0.5, 2.5, 50.0, 250.0), None])
-@pytest.mark.parametrize("stiffness_n_mm", [None, 2.0])
-def test_it_is_proven_on_a_mount_that_points_sideways(limits: TwistLimits | None, stiffness_n_mm: float | None) -> None:
+def sideways(limits: TwistLimits | None) -> tuple[Array, CellFacts]:
+    """Return the mount (4, 4) of a sensor that points sideways, and the facts of its cell."""
     mount = se3.from_euler_mm_deg(np.array([20.0, 30.0, 60.0, 70.0, 20.0, 0]))
     facts = CellFacts(
         0.01,
@@ -189,6 +189,13 @@ def test_it_is_proven_on_a_mount_that_points_sideways(limits: TwistLimits | None
         {"arm": ArmFacts(limits, 1.0, wrench=True)},
         {"sensor": SensorFacts("network", "arm", mount, 7e-3, 6e-3, 0.1)},
     )
+    return mount, facts
+
+
+@pytest.mark.parametrize("limits", [TwistLimits(0.02, 0.5, 0.5, 2.5, 50.0, 250.0), None])
+@pytest.mark.parametrize("stiffness_n_mm", [None, 2.0])
+def test_it_is_proven_on_a_mount_that_points_sideways(limits: TwistLimits | None, stiffness_n_mm: float | None) -> None:
+    mount, facts = sideways(limits)
     # 25 mm in, while half of the 7 mm that the network can report are read.
     for limit_mm, armed in ((21.0, True), (22.0, False)):
         settings = parse_interlocks({"it": {**ENTRY, "limit_mm": limit_mm, "stiffness_n_mm": stiffness_n_mm}})
@@ -219,13 +226,7 @@ def test_it_slides_five_millimetres_by_default() -> None:
 def test_the_faults_press_in_at_the_speed_of_the_gate_with_the_force_that_was_configured(
     limits: TwistLimits | None, speed_mm_s: float, stiffness_n_mm: float | None
 ) -> None:
-    mount = se3.from_euler_mm_deg(np.array([20.0, 30.0, 60.0, 70.0, 20.0, 0]))
-    facts = CellFacts(
-        0.01,
-        ("press",),
-        {"arm": ArmFacts(limits, 1.0, wrench=True)},
-        {"sensor": SensorFacts("network", "arm", mount, 7e-3, 6e-3, 0.1)},
-    )
+    mount, facts = sideways(limits)
     settings = DepthDisagreesConfig.model_validate({**ENTRY, "stiffness_n_mm": stiffness_n_mm})
     cases = tuple(settings.faults(facts))
     healthy = facts.healthy(START_NS, "press")
