@@ -81,7 +81,7 @@ def move(channel: str, kept: bool) -> None:
 def run(arguments: Sequence[str], out: Path) -> None:
     """Print a table of what each kill led to; writes ``keeper.json`` into ``out``."""
     parser = argparse.ArgumentParser(prog="touchcell bench keeper", description=__doc__.partition("\n")[0])
-    parser.add_argument("--seconds", type=float, default=40.0, help="how long each arm is watched")
+    parser.add_argument("--seconds", type=float, default=50.0, help="how long each arm is watched")
     parser.add_argument("--repeats", type=int, default=3)
     options = parser.parse_args(arguments)
     print(f"{'arm':<8}{'killed':<18}{'within 1 s':>12}{'in all':>10}{'fastest':>12}{'motors off':>12}")

@@ -2,8 +2,9 @@
 
 It passes frames between one client and the bus. When the client has died, or has not commanded for ``hold_after_s``, it
 holds the arm where the last command put it; ``lower_after_s`` later it lowers the arm along gravity, no faster than
-``lower_speed_mm_s``, takes the stiffness away slowly, disables the motors and ends. A client that only paused finds its
-arm held. What happens when this process itself is killed is what the motors' own timeout gives: they let go.
+``lower_speed_mm_s``, takes the stiffness away slowly, damps until nothing moves, disables the motors and ends. A client
+that only paused finds its arm held. What happens when this process itself is killed is what the motors' own timeout
+gives: they let go.
 
 The configuration is one JSON object on standard input: ``socket``, ``config`` (of the driver). Standard output says
 "ready".
@@ -32,6 +33,7 @@ from touchcell.drivers.damiao import codec
 from touchcell.drivers.damiao.codec import MitCommand, Ranges, Register
 from touchcell.drivers.damiao.descent import Descent
 from touchcell.drivers.damiao.driver import DamiaoCanConfig, open_bus
+from touchcell.drivers.damiao.fade import Fade
 from touchcell.drivers.kinematics.chain import SerialChain
 from touchcell.geometry.types import Array
 
@@ -41,7 +43,6 @@ FAILED: Final = b"E"
 """First bytes of packets that are no frames: an orderly end, the joints' offsets (rad, JSON), a failed transfer."""
 
 _REST_S = 2.0
-_FADE_S = 6.0
 _LONGEST_DESCENT_S = 30.0
 _PRIORITY = 50
 _MOST_FRAMES = 64
@@ -86,6 +87,7 @@ class Keeper:
         self._since_s = 0.0
         self._commanded_s = time.monotonic()
         self._descent: Descent | None = None
+        self._fade: Fade | None = None
         self._held: Array | None = None
         self._rested_s = 0.0
         self.latest_s = 0.0
@@ -230,7 +232,7 @@ class Keeper:
         elif self._phase is Phase.LOWERING:
             self._lower(now_s)
         elif self._phase is Phase.FADING:
-            self._fade(now_s)
+            self._let_go(now_s)
 
     def _setpoint(self) -> Array:
         """Return the joint angles (n,) that the client commanded last; measured ones where it commanded none."""
@@ -250,13 +252,15 @@ class Keeper:
         self._rested_s = self._rested_s + self._period_s if self._descent.rests else 0.0
         if self._rested_s > _REST_S or now_s - self._since_s > _LONGEST_DESCENT_S:
             self._held = q
+            self._fade = Fade(self._q, now_s)
             self._enter(Phase.FADING)
 
-    def _fade(self, now_s: float) -> None:
+    def _let_go(self, now_s: float) -> None:
         assert self._held is not None
-        left = 1.0 - (now_s - self._since_s) / _FADE_S
-        if left > 0.0:
-            self._command(self._held, left)
+        assert self._fade is not None
+        share = self._fade.share(self._q, now_s)
+        if share is not None:
+            self._command(self._held, share)
             return
         self._put([codec.DISABLE if on else None for on in self._enabled])
         self._enter(Phase.ENDED)
