@@ -88,10 +88,11 @@ def _ui_jog(browser: Any, folder: Path, picture: Path) -> None:
         page = _page(browser, address, _DESK)
         page.wait_for_function("document.querySelector('.text-mono')?.innerText.startsWith('idle')")
         page.locator("canvas").first.wait_for()
+        page.locator("img").first.wait_for()
         box = page.locator("[data-jog='x+']").bounding_box()
         page.mouse.move(box["x"] + 8, box["y"] + 8)
         page.mouse.down()
-        page.wait_for_function("document.querySelector('.text-mono')?.innerText.includes('x -7')")
+        page.wait_for_function("/^(?!idle).* x -7/.test(document.querySelector('.text-mono')?.innerText)")
         _take(page, picture, settles_s=0.0)
 
 

@@ -80,6 +80,7 @@ _WATCHDOG_S = 0.02
 _CONNECT_S = 5.0
 _FIRST_STATE_S = 2.0
 _FRESH_S = 0.25
+_FRAME_S = 0.5
 # Recovery has been seen to take 16 s (franka_ros issue 317).
 _RECOVERY_S = 20.0
 # franky's motions are smooth already, and libfranka's filter assumes that no state is ever lost: after a loss it jumps.
@@ -425,15 +426,19 @@ class FrankaArm(Arm):
         return DifferentialIk(chain, self._config.joint_limits.settings(own_controller=True))
 
     def _verify_frame(self, name: str, wanted: Array) -> None:
-        actual = np.asarray(getattr(self._robot.state, name).matrix)
-        if np.abs(actual - wanted).max() > _FRAME_TOLERANCE:
-            raise DeviceFault(
-                self.name,
-                f"{name} did not change as requested",
-                fault_class=FaultClass.CONFIGURATION,
-                needs=Remedy.OPERATOR,
-                hint="check the end effector settings in Desk",
-            )
+        """Raise a fault unless the controller tells the frame soon: a state from before the change may come first."""
+        deadline_ns = self._clock.now_ns() + round(_FRAME_S * 1e9)
+        while np.abs(np.asarray(getattr(self._robot.state, name).matrix) - wanted).max() > _FRAME_TOLERANCE:
+            now_ns = self._clock.now_ns()
+            if now_ns >= deadline_ns:
+                raise DeviceFault(
+                    self.name,
+                    f"{name} did not change as requested",
+                    fault_class=FaultClass.CONFIGURATION,
+                    needs=Remedy.OPERATOR,
+                    hint="check the end effector settings in Desk",
+                )
+            self._clock.sleep_until_ns(now_ns + _POLL_NS)
 
     def _activate(self) -> None:
         reading = self._reading("activate", _FRESH_S)

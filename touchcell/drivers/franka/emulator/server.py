@@ -303,9 +303,9 @@ class FrankaEmulator(Emulator):
         # A client that has missed one answer is waited for no more until it answers again.
         deadline_s = time.monotonic() + (self._patience_s if self._answers else 0.0)
         self._answers = False
-        while self._move_id is not None and not self._answers:
-            sources = [self._udp] if self._client is None else [self._udp, self._client]
-            ready, _, _ = select.select(sources, [], [], max(deadline_s - time.monotonic(), 0.0))
+        # One that is gone will not answer.
+        while self._move_id is not None and self._client is not None and not self._answers:
+            ready, _, _ = select.select([self._udp, self._client], [], [], max(deadline_s - time.monotonic(), 0.0))
             self._answers = self._udp in ready
             if not ready:
                 return
