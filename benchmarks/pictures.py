@@ -65,7 +65,7 @@ def _ui_run(browser: Any, folder: Path, picture: Path) -> None:
         # Read to its end: the slider is there, and at the end.
         page.wait_for_function("/\\d s · done/.test(document.querySelector('.q-badge')?.innerText)")
         time.sleep(_SLIDES_IN_S)
-        slider.click(position={"x": 0.62 * slider.bounding_box()["width"], "y": 10})
+        slider.click(position={"x": 0.75 * slider.bounding_box()["width"], "y": 10})
         page.wait_for_function("document.querySelector('.q-badge').innerText.startsWith('run')")
         page.locator("svg .present").first.wait_for(state="attached")
         page.locator("img").first.wait_for()

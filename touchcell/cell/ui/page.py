@@ -37,6 +37,7 @@ _COLOURS: Final = {
 }
 _UNITS: Final = {"mm": "mm", "deg": "°"}
 _CONTACT_RADIUS_M: Final = 0.004
+_COLUMN: Final = "contents lg:flex lg:flex-col gap-2 min-w-0"
 _NEAREST_M: Final = 0.42
 """Distance of the camera from a cell whose arms are drawn by their last links only."""
 
@@ -156,35 +157,38 @@ class RunPage:
             with ui.card().classes("w-full bg-red-1") as self._trip:
                 self._cause = ui.label().classes("whitespace-pre-wrap font-mono text-sm break-words")
             self._trip.visible = False
-            with ui.element("div").classes("w-full grid grid-cols-1 lg:grid-cols-2 gap-2"):
-                with ui.card().classes("w-full min-w-0"):
-                    self._scene = self._build_scene()
-                self._jog: JogPad | None = None
-                if self._view.plan.task.name == "jog":
-                    with ui.card().classes("w-full min-w-0") as self._jog_card:
-                        _title("Move by hand")
-                with ui.card().classes("w-full min-w-0"):
-                    _title("Interlocks")
-                    self._bars = _Bars()
-                with ui.card().classes("w-full min-w-0"):
-                    _title("Contacts")
-                    self._contacts = ui.html("", sanitize=False).classes("w-full overflow-x-auto")
-                    with ui.row().classes("w-full gap-2"):
-                        self._images = {
-                            sensor: ui.image().classes("w-full max-w-sm") for sensor in self._view.plan.sensor_roles
-                        }
-                    self._no_images = ui.label().classes("text-gray-500")
+            # Two columns, so that no card waits for a taller one beside it; a phone has one, in this order.
+            with ui.element("div").classes("w-full grid grid-cols-1 lg:grid-cols-2 gap-2 items-start"):
+                with ui.element("div").classes(_COLUMN):
+                    with ui.card().classes("w-full min-w-0 order-1"):
+                        self._scene = self._build_scene()
+                    with ui.card().classes("w-full min-w-0 order-3"):
+                        _title("Contacts")
+                        self._contacts = ui.html("", sanitize=False).classes("w-full overflow-x-auto")
+                        with ui.row().classes("w-full gap-2"):
+                            self._images = {
+                                sensor: ui.image().classes("w-full max-w-sm") for sensor in self._view.plan.sensor_roles
+                            }
+                        self._no_images = ui.label().classes("text-gray-500")
+                with ui.element("div").classes(_COLUMN):
+                    self._jog: JogPad | None = None
+                    if self._view.plan.task.name == "jog":
+                        with ui.card().classes("w-full min-w-0 order-2") as self._jog_card:
+                            _title("Move by hand")
+                    with ui.card().classes("w-full min-w-0 order-4"):
+                        _title("Interlocks")
+                        self._bars = _Bars()
+                    with ui.card().classes("w-full min-w-0 order-5"):
+                        _title("Events")
+                        self._events = ui.label().classes("whitespace-pre-wrap font-mono text-xs break-words")
                 # Over both columns: its labels are read, not only its shape.
-                with ui.card().classes("w-full min-w-0 lg:col-span-2"):
+                with ui.card().classes("w-full min-w-0 order-6 lg:col-span-2"):
                     _title("States")
                     self._diagram = ui.mermaid(_diagram(self._table, "")).classes("w-full overflow-x-auto")
                     self._shown_state = ""
-                with ui.card().classes("w-full min-w-0"):
+                with ui.card().classes("w-full min-w-0 order-7 lg:col-span-2"):
                     _title("Devices")
                     self._health = ui.html("", sanitize=False).classes("w-full overflow-x-auto")
-                with ui.card().classes("w-full min-w-0"):
-                    _title("Events")
-                    self._events = ui.label().classes("whitespace-pre-wrap font-mono text-xs break-words")
         self._scrub = ui.footer(value=False).classes("bg-white text-black px-3 py-1 shadow-2")
         with self._scrub, ui.row().classes("w-full items-center no-wrap"):
             ui.button(icon="play_arrow", on_click=self._toggle).props("round dense")
@@ -330,6 +334,7 @@ class RunPage:
         _title("Cell")
         self._groups: dict[str, Any] = {}
         self._marks: dict[str, Any] = {}
+        self._solid: set[str] = set()
         scene = self._view.scene
         if scene is None:
             ui.label("this cell cannot be drawn")
@@ -339,6 +344,9 @@ class RunPage:
             for number, part in enumerate(scene.parts):
                 if part.frame not in self._groups:
                     self._groups[part.frame] = element.group()
+                # Of boxes and paths, and of bases where nothing is drawn, the view need not be full.
+                if part.frame != "world" and not isinstance(part.solid, Polyline):
+                    self._solid.add(part.frame)
                 with self._groups[part.frame]:
                     _draw(element, part, f"/part/{self._name}/{number}.stl")
             for sensor in self._view.plan.sensor_roles:
@@ -367,7 +375,7 @@ class RunPage:
                 T_f_s = se3.from_euler_mm_deg(np.array([value for _, value, _ in row.values]))
                 mark.move(*(T_world_sensor @ se3.inverse(T_f_s))[:3, 3].tolist())
         if first and self._drawn:
-            points = np.array([T[:3, 3] for name, T in self._drawn.items() if name != "world"])
+            points = np.array([T[:3, 3] for frame, T in self._drawn.items() if frame in self._solid] or [np.zeros(3)])
             low, high = points.min(axis=0), points.max(axis=0)
             x, y, z = (0.5 * (low + high)).tolist()
             # Twice the distance at which what moves would fill the view: links reach beyond their frames.

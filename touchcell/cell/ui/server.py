@@ -119,7 +119,8 @@ def page_app(runs: Runs) -> App:
     ui.page("/", title="touchcell")(index)
     ui.page("/run/{name}", title="touchcell")(run)
     ui.page("/run/{name}/{source}", title="touchcell")(run)
-    ui.run_with(app, show_welcome_message=False, reconnect_timeout=3.0)
+    # A browser that draws without a GPU answers late; held buttons have a connection with a deadline of its own.
+    ui.run_with(app, show_welcome_message=False, reconnect_timeout=10.0)
     found: App = app
     return found
 
