@@ -31,12 +31,25 @@ ENVIRONMENT = os.environ | {"OMP_NUM_THREADS": "1"}
 
 
 @pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
+def playwright() -> Iterator[Any]:
     with sync_api.sync_playwright() as playwright:
-        options = ["--no-sandbox", "--use-gl=swiftshader", "--enable-unsafe-swiftshader"]
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=options)
-        yield browser
-        browser.close()
+        yield playwright
+
+
+@pytest.fixture(scope="module")
+def browser(playwright: Any) -> Iterator[Any]:
+    options = ["--no-sandbox", "--use-gl=swiftshader", "--enable-unsafe-swiftshader"]
+    browser = playwright.chromium.launch(executable_path=CHROMIUM, args=options)
+    yield browser
+    browser.close()
+
+
+@pytest.fixture(scope="module")
+def flat_browser(playwright: Any) -> Iterator[Any]:
+    """One that draws nothing in three dimensions, for what has deadlines."""
+    browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", "--disable-3d-apis"])
+    yield browser
+    browser.close()
 
 
 class Process:
@@ -201,12 +214,12 @@ def idle(page: Any) -> None:
 
 
 @takes_both_cores
-def test_an_arm_is_moved_from_the_page_for_as_long_as_a_button_is_held(browser: Any, tmp_path: Path) -> None:
+def test_an_arm_is_moved_from_the_page_for_as_long_as_a_button_is_held(flat_browser: Any, tmp_path: Path) -> None:
     out = tmp_path / "runs" / "jog"
     jog = Process(tmp_path, "jog", str(cell(tmp_path, time="simulated")), "--ui", "--out", str(out))
     try:
         address = jog.address()
-        context = browser.new_context(viewport={"width": 390, "height": 800})
+        context = flat_browser.new_context(viewport={"width": 390, "height": 800})
         page = context.new_page()
         page.set_default_timeout(1e3 * DEADLINE_S)
         page.goto(address)
@@ -257,12 +270,12 @@ def test_an_arm_is_moved_from_the_page_for_as_long_as_a_button_is_held(browser: 
 
 @takes_both_cores
 @pytest.mark.timeout(300)
-def test_a_hundred_reloads_and_vanishing_tabs_leave_no_traceback(browser: Any, tmp_path: Path) -> None:
+def test_a_hundred_reloads_and_vanishing_tabs_leave_no_traceback(flat_browser: Any, tmp_path: Path) -> None:
     out = tmp_path / "runs" / "jog"
     jog = Process(tmp_path, "jog", str(cell(tmp_path, time="simulated")), "--ui", "--out", str(out))
     try:
         address = jog.address()
-        context = browser.new_context()
+        context = flat_browser.new_context()
         page = context.new_page()
         page.set_default_timeout(1e3 * DEADLINE_S)
         page.goto(address)
