@@ -16,6 +16,14 @@ setup(
             optional=True,
         ),
         Extension(
+            "touchcell.control.interlocks._distances",
+            sources=["touchcell/control/interlocks/_distances.c"],
+            include_dirs=[numpy.get_include()],
+            extra_compile_args=["-O3", "-ffp-contract=off"],
+            # Without a compiler distances are computed in NumPy.
+            optional=True,
+        ),
+        Extension(
             "touchcell.drivers.v4l2._jpegc",
             sources=["touchcell/drivers/v4l2/_jpegc.c"],
             extra_compile_args=["-O3"],

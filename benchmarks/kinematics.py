@@ -1,6 +1,7 @@
 """``touchcell bench kinematics``: cost and accuracy of the kinematics.
 
-Prints the time per call, the deviation of open-loop integration from an exact path, and the behaviour at a singularity.
+Prints the time per call, also of distances between arms and obstacles, the deviation of open-loop integration from an
+exact path, and the behaviour at a singularity.
 """
 
 from __future__ import annotations
@@ -8,19 +9,27 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import json
+import os
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
+from functools import partial
 from pathlib import Path
+from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 
 from touchcell.cell.bench.provenance import provenance
+from touchcell.control.interlocks.collision import Box, Capsule, Clearances
 from touchcell.drivers.core.arm import LimitsConfig
 from touchcell.drivers.core.joint_setpoint import JointSetpoint
 from touchcell.drivers.kinematics.chain import ChainDescription, DifferentialIk, SerialChain, Tool
+from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 
 _CALLS = 5000
+_PAIRS = 128
 _RATE_HZ = 250.0
 _DIAMETER_M = 0.15
 _LAP_S = 8.0
@@ -45,6 +54,7 @@ def run(arguments: Sequence[str], out: Path) -> None:
     times_us = _times(chain, ik, working)
     faster_us = _engine_times(working)
     arms = _arms()
+    distances = _distances()
     path_mm, turn_deg = _circle(chain, ik, working)
     fastest, smallest_m, reach_mm, off_mm = _reach_out(chain, ik, working)
     print(f"{'call, six joints':32s}{'median us':>12s}{'p99 us':>10s}")
@@ -56,6 +66,9 @@ def run(arguments: Sequence[str], out: Path) -> None:
             print(f"{name:32s}{median_us:12.1f}{p99_us:10.1f}")
     for name, joints, worst in arms:
         print(f"{name:56s}{joints:3d} joints, largest deviation from pinocchio {worst:.1e}")
+    print(f"\n{f'distances of {_PAIRS} pairs of two arms and four boxes':56s}{'median us':>12s}{'p99 us':>10s}")
+    for name, (median_us, p99_us) in distances.items():
+        print(f"{name:56s}{median_us:12.1f}{p99_us:10.1f}")
     print(
         f"\ncircle of {_DIAMETER_M * 1e3:.0f} mm in {_LAP_S:g} s at {_RATE_HZ:g} Hz, open loop: off the path at most "
         f"{path_mm:.4f} mm, {turn_deg:.5f} deg"
@@ -67,6 +80,7 @@ def run(arguments: Sequence[str], out: Path) -> None:
         "times_us": times_us,
         "pinocchio_us": faster_us,
         "arms": [{"name": name, "joints": joints, "deviation": worst} for name, joints, worst in arms],
+        "distances_us": distances,
         "circle": {"off_mm": path_mm, "off_deg": turn_deg},
         "reach_out": {
             "fastest_joint_rad_s": fastest,
@@ -152,6 +166,56 @@ def _time(call: Callable[[], object]) -> tuple[float, float]:
         taken[k] = time.perf_counter_ns() - start_ns
     median, p99 = np.percentile(taken, [50, 99]) * 1e-3
     return float(median), float(p99)
+
+
+def _distances() -> dict[str, tuple[float, float]]:
+    """Return how long all distances of a scene take: compiled, in NumPy, and by coal where that is installed."""
+    rng = np.random.default_rng(3)
+    ends = rng.uniform(-1.0, 1.0, (16, 2, 3))
+    capsules = [Capsule(f"part {k}", (1, 1), (tuple(a), tuple(b)), 0.03) for k, (a, b) in enumerate(ends)]
+    poses = se3.from_euler_mm_deg(rng.uniform(-1.0, 1.0, (4, 6)) * [1000, 1000, 1000, 180, 80, 180])
+    boxes = [Box(f"box {k}", T, rng.uniform(0.05, 0.3, 3)) for k, T in enumerate(poses)]
+    arms: dict[str, Sequence[Capsule]] = {"left": capsules[:8], "right": capsules[8:]}
+    frames = np.tile(np.eye(4), (4, 1, 1))
+    times: dict[str, tuple[float, float]] = {}
+    for name, pure in (("compiled", ""), ("in NumPy", "1")):
+        with patch.dict(os.environ, {"TOUCHCELL_PURE_PYTHON": pure}):
+            found = Clearances(arms, dict.fromkeys(arms, 2), boxes)
+        assert len(found.pairs) == _PAIRS
+        times[name] = _time(partial(found.distances, frames))
+    with suppress(ImportError):
+        times["coal, without placing the bodies"] = _time(_coal_distances(found, capsules, boxes))
+    return times
+
+
+def _coal_distances(found: Clearances, capsules: Sequence[Capsule], boxes: Sequence[Box]) -> Callable[[], object]:
+    """Return a call that finds the distances of the same pairs with coal."""
+    import coal
+
+    bodies: dict[str, tuple[Any, Any]] = {}
+    for capsule in capsules:
+        a, b = np.array(capsule.ends_m)
+        length = float(np.linalg.norm(b - a))
+        x, y = np.linalg.svd((b - a)[None])[2][1:]
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = np.column_stack([x, y, np.cross(x, y)]), 0.5 * (a + b)
+        bodies[capsule.name] = coal.Capsule(capsule.radius_m, length), T
+    bodies |= {box.name: (coal.Box(*(2.0 * box.half_m)), box.T_world_box) for box in boxes}
+    placed = {}
+    for name, (shape, T) in bodies.items():
+        place = coal.Transform3s()
+        place.setRotation(T[:3, :3])
+        place.setTranslation(T[:3, 3])
+        placed[name] = shape, place
+    pairs = [(*placed[pair.part], *placed[pair.other]) for pair in found.pairs]
+    request, result = coal.DistanceRequest(), coal.DistanceResult()
+
+    def distances() -> None:
+        for pair in pairs:
+            result.clear()
+            coal.distance(*pair, request, result)
+
+    return distances
 
 
 def _circle(chain: SerialChain, ik: DifferentialIk, q: Array) -> tuple[float, float]:

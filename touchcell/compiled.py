@@ -17,6 +17,7 @@ from touchcell.errors import TouchcellError
 
 EXTENSIONS: Final = {
     "touchcell.geometry._se3c": "poses and Gaussians on them are computed in Python, about 20 times slower",
+    "touchcell.control.interlocks._distances": "distances between arms and obstacles take 0.2 ms a cycle, not 0.01",
     "touchcell.drivers.v4l2._jpegc": "damage inside a camera's JPEG frame is not noticed, only a missing end",
     "touchcell.perception._kernelsc": "image filters are OpenCV's, slower; marker estimators cannot be used",
     "touchcell.simulation._paint": "simulated images are drawn in Python, slower",

@@ -25,6 +25,7 @@ DATA = (
     *(f"touchcell/configs/{cell.name}" for cell in sorted((CHECKOUT / "configs").glob("*.yaml"))),
 )
 SOURCES = (
+    "touchcell/control/interlocks/_distances.c",
     "touchcell/geometry/_se3c.c",
     "touchcell/geometry/_se3_kernels.h",
     "touchcell/geometry/_gaussian_kernels.h",

@@ -110,6 +110,95 @@ def test_mujoco_agrees():
     assert compared > 150
 
 
+def scene(seed, *, degenerate=False):
+    """Two arms of four capsules among three boxes, and where all four frames are."""
+    rng = np.random.default_rng(seed)
+
+    def capsule(frame):
+        ends = rng.uniform(-0.4, 0.4, (2, 3))
+        if degenerate:
+            # Points, and segments along the axes of boxes.
+            ends[1] = ends[0] + rng.choice([0.0, 0.0, 0.3], 3)
+        return Capsule(f"part of {frame}", (0, frame), (tuple(ends[0]), tuple(ends[1])), float(rng.uniform(0.01, 0.06)))
+
+    angles = 0.0 if degenerate else 80.0
+    poses = se3.from_euler_mm_deg(rng.uniform(-1.0, 1.0, (7, 6)) * [600, 600, 600, angles, angles, angles])
+    boxes = [Box(f"box {k}", poses[k], rng.uniform(0.05, 0.3, 3)) for k in range(3)]
+    arms = {arm: [capsule(1) for _ in range(4)] for arm in ("left", "right")}
+    return arms, boxes, poses[3:]
+
+
+def clearances(monkeypatch, arms, boxes, *, pure):
+    monkeypatch.setenv("TOUCHCELL_PURE_PYTHON", "1" if pure else "")
+    return Clearances(arms, {"left": 2, "right": 2}, boxes)
+
+
+@pytest.mark.parametrize("degenerate", [False, True])
+@pytest.mark.parametrize("seed", range(10))
+def test_compiled_and_plain_distances_are_the_same(seed, degenerate, monkeypatch):
+    arms, boxes, frames = scene(seed, degenerate=degenerate)
+    compiled, plain = (clearances(monkeypatch, arms, boxes, pure=pure).distances(frames) for pure in (False, True))
+    assert len(compiled) == 16 + 24
+    np.testing.assert_allclose(compiled, plain, rtol=0.0, atol=1e-14)
+
+
+@pytest.mark.parametrize("pure", [False, True])
+def test_a_frame_that_is_not_finite_gives_no_distance(pure, monkeypatch):
+    arms, boxes, frames = scene(1)
+    frames[1, 0, 3] = np.nan
+    found = clearances(monkeypatch, arms, boxes, pure=pure)
+    of_left = [pair.arm == "left" or pair.other_arm == "left" for pair in found.pairs]
+    np.testing.assert_array_equal(np.isnan(found.distances(frames)), of_left)
+
+
+@pytest.mark.parametrize("pure", [False, True])
+def test_frames_of_another_number_of_links_are_an_error(pure, monkeypatch):
+    arms, boxes, frames = scene(1)
+    with pytest.raises(IndexError):
+        clearances(monkeypatch, arms, boxes, pure=pure).distances(frames[:3])
+
+
+@pytest.mark.parametrize("pure", [False, True])
+def test_coal_agrees(pure, monkeypatch):
+    coal = pytest.importorskip("coal")
+    arms, boxes, frames = scene(2)
+    found = clearances(monkeypatch, arms, boxes, pure=pure)
+    shapes = {box.name: (coal.Box(*(2.0 * box.half_m)), box.T_world_box) for box in boxes}
+    first = {"left": 0, "right": 2}
+    of_parts = [(arm, part) for arm, parts in arms.items() for part in parts]
+    placed = [coal_capsule(coal, frames[first[arm] :], part) for arm, part in of_parts]
+    pairs = [(i, j) for i in range(8) for j in range(i) if of_parts[i][0] != of_parts[j][0]]
+    judged = [coal_distance(coal, *placed[i], *placed[j]) for i, j in pairs]
+    judged += [coal_distance(coal, *placed[i], *shapes[box.name]) for i in range(8) for box in boxes]
+    apart = found.distances(frames)
+    # Where they overlap, coal tells how deep, and ours how deep at most a radius.
+    outside = np.array(judged) > 0.0
+    assert outside.sum() > 15
+    np.testing.assert_allclose(apart[outside], np.array(judged)[outside], rtol=0.0, atol=1e-9)
+    assert (apart[~outside] <= 0.0).all()
+
+
+def coal_capsule(coal, frames, part):
+    a, b = (T[:3, :3] @ end + T[:3, 3] for T, end in zip(frames[list(part.frames)], part.ends_m, strict=True))
+    length = float(np.linalg.norm(b - a))
+    _, _, turned = np.linalg.svd(((b - a) / length)[None])
+    x, y = turned[1:]
+    T = np.eye(4)
+    T[:3, :3] = np.column_stack([x, y, np.cross(x, y)])
+    T[:3, 3] = 0.5 * (a + b)
+    return coal.Capsule(part.radius_m, length), T
+
+
+def coal_distance(coal, shape, T, other, T_other):
+    places = []
+    for pose in (T, T_other):
+        place = coal.Transform3s()
+        place.setRotation(pose[:3, :3])
+        place.setTranslation(pose[:3, 3])
+        places.append(place)
+    return coal.distance(shape, places[0], other, places[1], coal.DistanceRequest(), coal.DistanceResult())
+
+
 def test_neighbouring_links_and_static_pairs_are_left_out():
     def link(k):
         return Capsule(f"link {k}", (k, k), ((0.0, 0.0, 0.0), (0.0, 0.0, 0.1)), 0.05)

@@ -6,11 +6,14 @@ one from the shoulder to the tool stands for all links between, for an arm that 
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
+from touchcell import compiled
 from touchcell.geometry.types import Array
 
 BASE = 0
@@ -99,14 +102,23 @@ class Clearances:
             Pair(capsules[i][0], capsules[i][1].name, capsules[j][0], capsules[j][1].name) for i, j in of_arms
         ) + tuple(Pair(capsules[i][0], capsules[i][1].name, None, boxes[k].name) for i, k in of_boxes)
         of_ends = [[first[arm] + frame for frame in frames] for arm, _, frames in capsules]
-        self._frames = np.array(of_ends, dtype=np.intp).reshape(-1, 2).T
-        self._ends = np.array([[*part.ends_m] for _, part, _ in capsules]).reshape(-1, 2, 3).transpose(1, 0, 2)
+        ends = [[*part.ends_m] for _, part, _ in capsules]
         radius = np.array([part.radius_m for _, part, _ in capsules])
-        self._of_arms = np.array(of_arms, dtype=np.intp).reshape(-1, 2).T
-        self._of_boxes = np.array(of_boxes, dtype=np.intp).reshape(-1, 2).T
-        self._radii = np.concatenate([radius[self._of_arms].sum(axis=0), radius[self._of_boxes[0]]])
-        self._T_box = np.array([box.T_world_box for box in boxes]).reshape(-1, 4, 4)[self._of_boxes[1]]
-        self._half = np.array([box.half_m for box in boxes]).reshape(-1, 3)[self._of_boxes[1]]
+        arms, obstacles = _transposed(of_arms), _transposed(of_boxes)
+        poses = np.array([box.T_world_box for box in boxes], dtype=np.float64).reshape(-1, 4, 4)
+        half = np.array([box.half_m for box in boxes], dtype=np.float64).reshape(-1, 3)
+        # In the order in which the compiled function takes them.
+        self._about = (
+            _transposed(of_ends),
+            np.array(ends, dtype=np.float64).reshape(-1, 2, 3).transpose(1, 0, 2).copy(),
+            arms,
+            obstacles,
+            np.concatenate([radius[arms].sum(axis=0), radius[obstacles[0]]]),
+            poses[obstacles[1]],
+            half[obstacles[1]],
+        )
+        pure = os.environ.get("TOUCHCELL_PURE_PYTHON")
+        self._compiled = None if pure else compiled.extension("touchcell.control.interlocks._distances")
 
     def distances(self, T_world_frames: Array) -> Array:
         """Return (p,) distances in m of all pairs; negative where they overlap, by at most a capsule's radius.
@@ -114,17 +126,27 @@ class Clearances:
         Args:
             T_world_frames: (f, 4, 4) all frames of all arms, in the order of ``bodies``.
         """
-        T = T_world_frames[self._frames]
-        tail, head = np.einsum("ecij,ecj->eci", T[:, :, :3, :3], self._ends) + T[:, :, :3, 3]
-        i, j = self._of_arms
-        k = self._of_boxes[0]
+        if self._compiled is not None:
+            found: Array = self._compiled.clearances(
+                np.ascontiguousarray(T_world_frames, dtype=np.float64), *self._about
+            )
+            return found
+        frames, ends, of_arms, of_boxes, radii, T_box, half = self._about
+        T = T_world_frames[frames]
+        tail, head = np.einsum("ecij,ecj->eci", T[:, :, :3, :3], ends) + T[:, :, :3, 3]
+        i, j = of_arms
+        k = of_boxes[0]
         apart = np.empty(len(self.pairs))
         if i.size:
             apart[: i.size] = segment_distances(tail[i], head[i], tail[j], head[j])
         if k.size:
-            apart[i.size :] = segment_box_distances(tail[k], head[k], self._T_box, self._half)
-        clear: Array = apart - self._radii
+            apart[i.size :] = segment_box_distances(tail[k], head[k], T_box, half)
+        clear: Array = apart - radii
         return clear
+
+
+def _transposed(pairs: Sequence[Sequence[int]]) -> NDArray[np.intp]:
+    return np.array(pairs, dtype=np.intp).reshape(-1, 2).T.copy()
 
 
 def _links_between(frames: tuple[int, int], other: tuple[int, int]) -> int:
