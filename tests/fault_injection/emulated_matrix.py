@@ -173,8 +173,9 @@ _STILL_S: Final = 0.12
 # A process that does not run for so long was starved.
 _STALL_S: Final = 0.15
 _TRIES: Final = 6
-# The last state; on a stop request, a task enters it from the previous one, in which it presses.
+# On a stop request a task enters the first from one of the others, in which it presses.
 _AFTER_STOP: Final = "retract"
+_PRESSING: Final = ("run", "grab")
 _RATE_HZ: Final = 50.0
 
 
@@ -408,7 +409,7 @@ def _run(case: EmulatedCase, rig: DeviceFixture, emulator: Emulated, plan: CellP
         loop.begin()
         going = True
         while going:
-            if place.state == _AFTER_STOP and task.state == task.states[-2] and not stop.count:
+            if place.state == _AFTER_STOP and task.state in _PRESSING and not stop.count:
                 stop.ask()
             if injected_s is None and task.state == place.state:
                 wait -= 1
