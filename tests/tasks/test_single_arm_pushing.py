@@ -121,7 +121,7 @@ def test_an_object_that_is_first_touched_at_a_corner_between_two_sides_arrives(t
     data["scene"]["objects"]["prism"] |= {"shape": hexagon, "pose_mm_deg": [5.85, 12.6, 0, 0, 0, -18.2]}
     pushed = push(data, tmp_path)
     assert pushed.path[-1] == END[-1]
-    assert pushed.object_mm_deg[:2] == pytest.approx((150.0, 20.0), abs=0.6)
+    assert pushed.object_mm_deg[:2] == pytest.approx((150.0, 20.0), abs=0.8)
 
 
 def test_a_target_that_asks_for_more_tilt_than_is_allowed_is_given_up(tmp_path):

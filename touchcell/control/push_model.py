@@ -36,7 +36,7 @@ _HEADING_NOISE_RAD: Final = math.radians(0.3)
 _OFFSET_PRIOR_M: Final = 0.015
 _LEVER_PRIOR: Final = 0.15
 """Standard deviation of ``c^2`` over its first value."""
-_DRIFT_M_PER_SQRT_M: Final = 0.003
+_DRIFT_M_PER_SQRT_M: Final = 0.0015
 """Growth of the uncertainty of ``s`` over travel: what presses on the table, and where, changes ..."""
 _FOLLOWED_DRIFT_M_PER_SQRT_M: Final = 0.010
 """... and where a follower presses, too."""
@@ -62,11 +62,13 @@ class Contact:
     Attributes:
         x_m, y_m: point of the object at which it is pushed.
         heading_rad: direction of the inward contact normal.
+        depth_m: of the indentation: the tip's centre is by its radius less this behind the point.
     """
 
     x_m: float
     y_m: float
     heading_rad: float
+    depth_m: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,7 +19,7 @@ from touchcell.geometry.types import Array
 
 _FIRST_CHANGE: Final = 0.012
 """Change from which a frame counts: less is noise ..."""
-_LAST_CHANGE: Final = 0.2
+LAST_CHANGE: Final = 0.2
 """... and to which: the change of deeper contacts is no straight line."""
 _FEWEST: Final = 3
 _STRAIGHT: Final = 0.6
@@ -55,6 +55,8 @@ class TouchZero:
         """True once the error is known as well as it will be."""
         self.error_m: float | None = None
         """Depth that the model reads beyond what the arm's motion says; None while it is not known."""
+        self.change_per_m: float | None = None
+        """Change of the image per depth, while that is small; None while it is not known."""
 
     def moved(self, t_ns: int, T_base_sensor: Array) -> None:
         """Take note of the sensor's pose (4, 4)."""
@@ -76,7 +78,7 @@ class TouchZero:
             return
         if self.error_m is not None:
             self._press(self._advance_m(t_frame_ns), T_s_f)
-        elif _FIRST_CHANGE < change < _LAST_CHANGE:
+        elif _FIRST_CHANGE < change < LAST_CHANGE:
             advance_m, speed_m_s, now_m_s = self._advance_m(t_frame_ns), self._speed_m_s(0), self._speed_m_s(-_NOW)
             if speed_m_s > _AT_REST_M_S:
                 # Not while it slows down: frames that are late would then show less than there is.
@@ -139,6 +141,7 @@ class TouchZero:
         error_m = _depth_m(T_s_f) - depth_m
         if abs(error_m) < _LARGEST_M:
             self.error_m = self._touched_error_m = error_m
+            self.change_per_m = change / depth_m
             self._pressed.append((advance_m * float(T_s_f[2, 2]), _depth_m(T_s_f)))
 
 

@@ -11,7 +11,7 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat
 
 from touchcell.control.pid import PidGains
 from touchcell.control.servo import TactileServo
-from touchcell.control.touch_zero import TouchZero
+from touchcell.control.touch_zero import LAST_CHANGE, TouchZero
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 from touchcell.perception.features.feature_model import TouchedFeature
@@ -256,6 +256,7 @@ class ContactServo:
         self._easing_run = run if isinstance(run, Easing) else None
         self._depth_run = run if isinstance(run, DepthAware) else None
         self._touch_zero: TouchZero | None = None
+        self._change_per_m: float | None = None
         self._config = config
         self._T_tcp_sensor = context.T_tcp_sensor[sensor]
         self._running_axes = None if all(running_axes) else np.array(running_axes, np.float64)
@@ -384,6 +385,7 @@ class ContactServo:
         zero.saw(contact.t_frame_ns, contact.seq, contact.change, self.T_s_f_measured if valid else None)
         if zero.error_m is not None:
             self._depth_run.correct_depth(zero.error_m)
+            self._change_per_m = zero.change_per_m
         if zero.ended:
             self._touch_zero = None
 
@@ -458,7 +460,7 @@ class ContactServo:
             # Standing still until several frames have shown it.
             self._felt_s += self._period_s
             if self._felt_s >= _FEEL_S:
-                self._next_goal(self.T_s_f)
+                self._next_goal(self._felt_contact())
         elif self._goal.feels and self.change_since_zero > _FELT_CHANGE and self._felt_s < _FEEL_S:
             # A touch is as light as it can be: what is pressed moves.
             self._felt_s += self._period_s
@@ -470,6 +472,15 @@ class ContactServo:
             rate = math.radians(self._config.max_turn_deg_s)
             V_s[3:] = turn * (min(rate, _APPROACH_PER_S * angle_rad) / max(angle_rad, 1e-9))
         return self._accelerated(self._Ad_tcp_sensor @ V_s)
+
+    def _felt_contact(self) -> Array | None:
+        """Return the contact (4, 4) that is felt, as deep as the change of the image says; None where none is valid."""
+        T_s_f, change = self.T_s_f, self.change_since_zero
+        if T_s_f is None or self._change_per_m is None or change > LAST_CHANGE:
+            return T_s_f
+        normal, felt = T_s_f[:3, 2], T_s_f.copy()
+        felt[:3, 3] -= normal * (change / self._change_per_m + normal @ T_s_f[:3, 3])
+        return felt
 
     def _free_speed_m_s(self, goal: Goal, distance_m: float, speed_m_s: float, feeling_m_s: float) -> float:
         """Return the speed at a distance from a goal: as fast as it can still slow down."""

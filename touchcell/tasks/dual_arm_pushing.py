@@ -21,6 +21,7 @@ from touchcell.tasks.free_motion import Goal, heading_of, placed
 from touchcell.tasks.interface import CONTACT_DEPTH, TaskContext, TaskSpec
 from touchcell.tasks.predictive_push import PredictivePush, twist_in_sensor
 from touchcell.tasks.push_bounds import PushBounds
+from touchcell.tasks.push_standing import Standing
 from touchcell.tasks.servoing import ServoConfig, ServoTask, servo_motions
 from touchcell.tasks.single_arm_pushing import Push, PushConfig
 
@@ -86,12 +87,21 @@ class Follow:
         config: parameters.
         push: the leader's behavior.
         bounds: of the follower.
+        standing: watch over the object by the follower.
         T_leader_follower: pose (4, 4) of the follower's base in the leader's.
     """
 
-    def __init__(self, config: DualArmPushingConfig, push: Push, bounds: PushBounds, T_leader_follower: Array) -> None:
+    def __init__(
+        self,
+        config: DualArmPushingConfig,
+        push: Push,
+        bounds: PushBounds,
+        standing: Standing,
+        T_leader_follower: Array,
+    ) -> None:
         self._push = push
         self._bounds = bounds
+        self._standing = standing
         self._at_limit = ""
         self._active = config.follower.active
         self._T_leader_follower = T_leader_follower
@@ -156,7 +166,8 @@ class Follow:
             far = push.touched(self._T_leader_follower @ now, T_s_f)
             self._far = Pose(far.x_m, far.y_m, far.heading_rad)
             push.touched_beyond(far)
-        self._at_limit = self._bounds.reached(dt_s, before, now, T_s_f)
+        fallen = "" if T_s_f is None else self._standing.changed(dt_s, now, T_s_f)
+        self._at_limit = fallen or self._bounds.reached(dt_s, before, now, T_s_f)
         return bool(self._at_limit)
 
     @property
@@ -175,10 +186,12 @@ class Follow:
         return self._push.predictive is not None and self._push.predictive.must_place
 
     def begin_approach(self, T_base_sensor: Array) -> None:
-        """Do nothing: the leader knows from where the object is approached."""
+        """Take note that the object is to be touched anew."""
+        self._standing.begin_approach()
 
     def begin_sidestep(self, T_base_sensor: Array) -> None:
         """Let go of the object."""
+        self._standing.let_go()
         self._steps = self._step_opposite(T_base_sensor)
 
     def next_goal(self, T_base_sensor: Array, T_s_f: Array | None) -> Goal | None:
@@ -215,11 +228,12 @@ class Follow:
 
 def build(config: DualArmPushingConfig, context: TaskContext) -> ServoTask:
     """Build the task for a cell that has ``leader`` and ``follower`` with a sensor each."""
-    push, hold = Push(config, PushBounds(context, LEADER, LEADER_SENSOR), followed=True), config.follower
+    standing = Standing(LEADER_SENSOR)
+    push, hold = Push(config, PushBounds(context, LEADER, LEADER_SENSOR), standing, followed=True), config.follower
     leader = ContactServo(LEADER, LEADER_SENSOR, config, config.reference_mm_deg, push, context)
     bases = [context.T_world_base.get(arm, np.eye(4)) for arm in (LEADER, FOLLOWER)]
     bounds = PushBounds(context, FOLLOWER, FOLLOWER_SENSOR)
-    follow = Follow(config, push, bounds, se3.compose(se3.inverse(bases[0]), bases[1]))
+    follow = Follow(config, push, bounds, Standing(FOLLOWER_SENSOR), se3.compose(se3.inverse(bases[0]), bases[1]))
     follower = ContactServo(FOLLOWER, FOLLOWER_SENSOR, hold, hold.reference_mm_deg, follow, context)
     return ServoTask("dual_arm_pushing", config, context, leader, follower)
 

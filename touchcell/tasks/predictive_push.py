@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from statistics import fmean
 from typing import Final
 
 import numpy as np
@@ -26,6 +27,11 @@ _STARTING_M_S: Final = 0.008
 """Speed until the object moves: a tip that is pressed in fast overshoots, and a follower gives way too early."""
 _MOVED_M: Final = 0.4e-3
 """Way of the contact from which the object moves; less may be an error of the depth, which grows meanwhile."""
+_LOADING_M: Final = (0.8e-3, 3e-3)
+"""Way of the contact over which what its normal is misread under the load of a push shows: the side has not turned yet
+but by what the centre of friction is beside the contact."""
+_LOADING_M_S: Final = 0.015
+"""Speed over that way."""
 _MOST_SIDESTEPS: Final = 3
 _EXPECTED_M: Final = 0.012
 """Standard deviation of the centre beside the line of the approach."""
@@ -44,7 +50,9 @@ _CLEAR_M: Final = 0.008
 _NEAR_M: Final = 0.004
 """The same beside a side whose edges have been felt."""
 _SLOW_M: Final = 0.0015
-"""Distance before a side from which it is approached slowly: what touches tell of it is wrong by less."""
+"""Distance before a side from which it is approached slowly: what touches tell of it is wrong by less ..."""
+_UNSURE_M: Final = 0.003
+"""... but between edges by which it is only roughly known how it is turned; a fast touch turns a light object."""
 _EDGE_SIGMA_M: Final = 1.5e-3
 """Uncertainty of a side's middle by the touch of one edge and a width that nothing has shown to be right ..."""
 _EDGES_SIGMA_M: Final = 0.3e-3
@@ -194,6 +202,8 @@ class PredictivePush:
         self._side_heading: float | None = None
         self._heading_error = 0.0
         self._loaded_m = 0.0
+        self._loading: list[tuple[float, float]] = []
+        self._loading_m = self._moved_m = 0.0
         self.reach_felt_m: float | None = None
         """Half of the object along the contact normal, by the contacts of two arms; None while nothing tells."""
         self.depth_error_m = 0.0
@@ -370,7 +380,7 @@ class PredictivePush:
             sigma_m = max(_EDGES_SIGMA_M, 0.5 * off_m)
             if not is_told or sigma_m < 0.5 * _WIDTH_M:
                 touches = yield from self._touch_twice(T_base_sensor, found, 0.5 * felt_m, other.left)
-                straight = self._straightened(found, touches)
+                straight = self._straightened(found, touches, (one, other))
                 # Where nothing shows that there is a side between the edges, they may be anything else.
                 confirmed = straight is not None or 0.5 * felt_m - _FROM_EDGE_M < _LEAST_APART_M
                 return straight or found, _EDGES_SIGMA_M if confirmed else max(sigma_m, _UNCONFIRMED_M)
@@ -410,17 +420,16 @@ class PredictivePush:
         for left_m in (left * apart_m, -left * apart_m):
             clear = at.ahead(-self._settings.tip_radius_m - _NEAR_M).ahead(left_m, 0.5 * math.pi)
             yield Goal(placed(T_base_sensor, clear), passes=True)
-            yield Goal(placed(T_base_sensor, clear.ahead(2.0 * _NEAR_M)), feels=True, slow_m=_NEAR_M + _SLOW_M)
+            yield Goal(placed(T_base_sensor, clear.ahead(2.0 * _NEAR_M)), feels=True, slow_m=_NEAR_M + _UNSURE_M)
             if self._felt is not None:
                 touches.append(self._felt)
             yield Goal(placed(T_base_sensor, clear), passes=True)
         return touches
 
-    def _straightened(self, middle: Contact, touches: Sequence[Contact]) -> Contact | None:
-        """Return the middle of a side as the arm's positions at two touches of it say that it lies.
+    def _straightened(self, middle: Contact, touches: Sequence[Contact], edges: Sequence[EdgeSearch]) -> Contact | None:
+        """Return the middle of a side as the arm's positions at two touches of it, and at its edges, say that it lies.
 
-        Both touches are misread by the same: their normals do not count, nor does what that shifts the edges. None
-        where they are not on a straight side there.
+        Their normals do not count. None where the touches are not on a straight side there.
         """
         if len(touches) < 2:
             return None
@@ -435,7 +444,11 @@ class PredictivePush:
         # What is misread of the tilt moves the point at which a round tip seems to touch.
         x, y = 0.5 * (left.x_m + right.x_m), 0.5 * (left.y_m + right.y_m)
         line = Pose(x, y, heading)
-        aside_m = line.local((middle.x_m, middle.y_m))[1] - self._settings.tip_radius_m * misread
+        found_m = [each.edge_on(line) for each in edges]
+        if None in found_m:
+            aside_m = line.local((middle.x_m, middle.y_m))[1] - self._settings.tip_radius_m * misread
+        else:
+            aside_m = fmean(each for each in found_m if each is not None)
         found = line.ahead(aside_m, 0.5 * math.pi)
         return Contact(found.x, found.y, heading)
 
@@ -457,7 +470,7 @@ class PredictivePush:
         depth_m = max(0.0, -float(T_s_f[:3, 2] @ T_s_f[:3, 3]))
         normal = T_base_sensor[:3, :3] @ T_s_f[:3, 2]
         at = _tip_behind(T_base_sensor, heading_of(normal), depth_m - self._settings.tip_radius_m)
-        return Contact(at.x, at.y, at.heading)
+        return Contact(at.x, at.y, at.heading, depth_m)
 
     def pause(self) -> None:
         """Stand still: the contact is not known."""
@@ -530,7 +543,8 @@ class PredictivePush:
         else:
             depth_m = max(0.0, -float(T_s_f[:3, 2] @ T_s_f[:3, 3]))
             behind = Pose(float(T_base_sensor[0, 3]), float(T_base_sensor[1, 3]), heading).ahead(-depth_m)
-        contact = behind.ahead(settings.tip_radius_m + self.depth_error_m)
+        ahead_m = settings.tip_radius_m + self.depth_error_m
+        contact = behind.ahead(ahead_m)
         if self._resting is not None:
             self._touch_again(contact, *self._resting)
             self._rested, self._resting, self.located = self._resting, None, None
@@ -541,10 +555,13 @@ class PredictivePush:
             estimator.move_contact(middle_m, _EXPECTED_M)
         self._contact = Contact(contact.x, contact.y, heading)
         self._resting_at = self._resting_at or self._contact
-        ahead_m, _ = Pose(self._resting_at.x_m, self._resting_at.y_m, heading).local((contact.x, contact.y))
-        self._moves = self._moves or ahead_m > _MOVED_M
+        self._moved_m, _ = Pose(self._resting_at.x_m, self._resting_at.y_m, heading).local((contact.x, contact.y))
+        self._moves = self._moves or self._moved_m > _MOVED_M
         estimator.update(self._contact)
         model = estimator.model
+        # What it had turned by while the error of its normal showed was taken for a part of that.
+        turned = model.offset_m * self._loading_m / (model.reach_m**2 + model.lever_m2)
+        contact = Pose(behind.x, behind.y, heading + turned).ahead(ahead_m)
         ahead = contact.ahead(model.reach_m)
         self._middle = ahead.ahead(model.middle_m or 0.0, 0.5 * math.pi)
         return ahead.ahead(model.offset_m, 0.5 * math.pi), self._middle
@@ -553,15 +570,25 @@ class PredictivePush:
         """Return a heading without the error that shows while the object rests: its side lies between its edges.
 
         Models misread normals otherwise under load than at a touch, so the error counts as it is when the object
-        begins to move.
+        has begun to slide.
         """
         if self._resting is not None and self._side_is_felt:
             self._side_heading, self._heading_error, self._loaded_m = self._resting[0].heading, 0.0, 0.0
-        if self._side_heading is not None and not self._moves and depth_m >= self._loaded_m:
-            error = math.remainder(heading - self._side_heading, 2.0 * math.pi)
-            if abs(error) < _SIDE_SIGMA_RAD:
+            self._loading, self._loading_m, self._moved_m = [], 0.0, 0.0
+        if self._side_heading is None:
+            return heading
+        error = math.remainder(heading - self._side_heading, 2.0 * math.pi)
+        begins_m, ends_m = _LOADING_M
+        if abs(error) > _SIDE_SIGMA_RAD:
+            return heading - self._heading_error
+        if not self._moves:
+            if depth_m >= self._loaded_m:
                 self._heading_error += _ERROR_SHARE * (error - self._heading_error)
                 self._loaded_m = depth_m
+            return self._side_heading
+        if begins_m < self._moved_m < ends_m:
+            self._loading.append((self._moved_m, error))
+            self._loading_m, self._heading_error = (fmean(each) for each in zip(*self._loading, strict=True))
         return heading - self._heading_error
 
     def _touch_again(self, contact: Pose, middle: Pose, sigma_m: float) -> None:
@@ -597,6 +624,8 @@ class PredictivePush:
         fastest = settings.speed_m_s if self._known else min(settings.speed_m_s, _EXPLORING_M_S)
         if not self._moves:
             fastest = min(fastest, _STARTING_M_S)
+        elif self._side_heading is not None and self._moved_m < _LOADING_M[1]:
+            fastest = min(fastest, _LOADING_M_S)
         wanted = min(fastest, max(braking, settings.slowest_m_s))
         self._speed_m_s = min(wanted, self._speed_m_s + settings.accel_m_s2 * dt_s)
 

@@ -21,6 +21,7 @@ from touchcell.tasks.planned_places import PlannedPlace
 from touchcell.tasks.predictive_push import PredictivePush, PredictivePushSettings, Progress, twist_in_sensor
 from touchcell.tasks.push_bounds import PushBounds
 from touchcell.tasks.push_path import Obstacle, plan
+from touchcell.tasks.push_standing import Standing
 from touchcell.tasks.servoing import ARM, SENSOR, ServoConfig, ServoTask, servo_motions
 
 Mm = tuple[float, float]
@@ -58,8 +59,8 @@ class PushConfig(ContactServoConfig):
             the path, which the keys ``align_*`` set.
         tip_radius_mm: radius of the tip.
         sides: whether the pushed side is flat, or round so that its normal points at the object's centre.
-        friction_radius_mm: mean distance of the object's bottom from its centre, a first value for the estimate; three
-            quarters of the distance from contact to centre without it.
+        friction_radius_mm: mean distance of the object's bottom from its centre, a first value for the estimate; 0.8
+            of the distance from contact to centre without it: more than of a square (0.77), as a push loads the front.
         contact_friction: slope of the friction cone between skin and object that steering may use.
         recontact_mm: where the object is found to be pushed farther than this beside its centre, the arm lets go of it,
             steps aside and touches it again opposite its centre; none: never.
@@ -131,7 +132,7 @@ class PushConfig(ContactServoConfig):
     def predictive(self, *, followed: bool = False) -> PredictivePush:
         """Return the predictive steering, in SI units; ``followed`` where a follower presses, too."""
         lead_mm = self.object_center_offset_mm
-        radius_mm = self.friction_radius_mm or 0.75 * (lead_mm - self.tip_radius_mm)
+        radius_mm = self.friction_radius_mm or 0.8 * (lead_mm - self.tip_radius_mm)
         settings = PredictivePushSettings(
             lead_m=1e-3 * lead_mm,
             tip_radius_m=1e-3 * self.tip_radius_mm,
@@ -184,7 +185,7 @@ class SingleArmPushingConfig(PushConfig, ServoConfig):
 class Push:
     """Behavior of pushing: along the contact normal, steered to the target, until it is reached."""
 
-    def __init__(self, config: PushConfig, bounds: PushBounds, *, followed: bool = False) -> None:
+    def __init__(self, config: PushConfig, bounds: PushBounds, standing: Standing, *, followed: bool = False) -> None:
         self._speed_m_s = 1e-3 * config.push_speed_mm_s
         self._timeout_s = config.push_timeout_s
         self._alignment = config.alignment()
@@ -194,7 +195,8 @@ class Push:
         self._max_cross_track_m = 1e-3 * config.max_cross_track_mm
         self._lead_m = 1e-3 * config.object_center_offset_mm
         self._bounds = bounds
-        self._at_limit = ""
+        self._standing = standing
+        self._at_limit = self._fallen = ""
         self._aim: Aim | None = None
         self._miss_m = self._sigma_m = 0.0
         self._left_m_s = 0.0
@@ -250,11 +252,13 @@ class Push:
 
     def begin_approach(self, T_base_sensor: Array) -> None:
         """Take note of the direction of the approach, in which the object is expected."""
+        self._standing.begin_approach()
         if self._predictive is not None:
             self._predictive.begin_approach(T_base_sensor)
 
     def begin_sidestep(self, T_base_sensor: Array) -> None:
         """Let go: the object rests where it is until it is touched again."""
+        self._standing.let_go()
         if self._predictive is not None:
             self._predictive.begin_sidestep(T_base_sensor)
 
@@ -290,19 +294,21 @@ class Push:
             return bool(self._at_limit)
         self._y_is_left = -float(np.sign(now[2, 0]))
         self.depth_m = max(0.0, -float(T_s_f[:3, 2] @ T_s_f[:3, 3]))
+        self._fallen = self._fallen or self._standing.changed(dt_s, now, T_s_f)
         if self._predictive is not None:
             progress = self._predictive.update(dt_s, now, T_s_f)
             self._aim, self._miss_m, self._sigma_m = _aim_of(progress), progress.miss_m, progress.sigma_m
         else:
             self._aim = self._alignment.aim(now, T_s_f)
             self._left_m_s = self._alignment.step(self._aim, dt_s)
-        return self._aim.remaining_m <= 0.0 or bool(self._at_limit) or self._strayed(self._aim)
+        ends = bool(self._at_limit) or bool(self._fallen)
+        return self._aim.remaining_m <= 0.0 or ends or self._strayed(self._aim)
 
     def shortfall(self) -> str:
         """Return how far the object ended from its target, or from its path, if that is beyond the tolerances."""
         aim = self._aim
-        if aim is None:
-            return self._at_limit
+        if aim is None or self._fallen:
+            return self._fallen or self._at_limit
         within = aim.target_distance_m + _SIGMAS * self._sigma_m <= self._tolerance_m
         if self._at_limit and aim.remaining_m > 0.0 and not within:
             return f"{self._at_limit}; object {1e3 * aim.target_distance_m:.0f} mm from the target"
@@ -393,7 +399,7 @@ def _motions(config: SingleArmPushingConfig, T_base_tcp: Array | None, T_tcp_sen
 
 def build(config: SingleArmPushingConfig, context: TaskContext) -> ServoTask:
     """Build the task for a cell that has ``arm`` with a sensor."""
-    push = Push(config, PushBounds(context, ARM, SENSOR))
+    push = Push(config, PushBounds(context, ARM, SENSOR), Standing(SENSOR))
     servo = ContactServo(ARM, SENSOR, config, config.reference_mm_deg, push, context)
     return ServoTask("single_arm_pushing", config, context, servo)
 
