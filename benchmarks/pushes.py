@@ -178,6 +178,7 @@ def run(arguments: Sequence[str], out: Path) -> None:
     parser.add_argument("--seeds", type=int, nargs="*", help="these rigs in place of the first")
     parser.add_argument("--before", type=Path, help="pushes.json of an earlier call, to compare with")
     parser.add_argument("--map", action="store_true", help="draw the maps, too")
+    parser.add_argument("--every", type=int, default=1, metavar="N", help="of each axis of a map only each N-th value")
     parser.add_argument("--tall", action="store_true", help="push tall objects that weigh other than told")
     options = parser.parse_args(arguments)
     perform = Perform(measures, out / "pushes")
@@ -192,7 +193,7 @@ def run(arguments: Sequence[str], out: Path) -> None:
             text.append(f"before: {before['provenance']['commit']}")
         (out / "pushes_time.txt").write_text("\n".join([*text, "", *lines]) + "\n")
     if options.map:
-        _draw_maps(perform, out)
+        _draw_maps(perform, out, options.every)
     if options.tall:
         _tall(perform, out)
 
@@ -320,7 +321,7 @@ def table(rigs: Sequence[Rig], ended: Mapping[int, Finished]) -> list[str]:
     return lines
 
 
-def _draw_maps(perform: Perform, out: Path) -> None:
+def _draw_maps(perform: Perform, out: Path, every: int) -> None:
     import matplotlib as mpl
 
     mpl.use("Agg")
@@ -330,8 +331,9 @@ def _draw_maps(perform: Perform, out: Path) -> None:
     figure, axes = plt.subplots(2, 2, figsize=(11, 8.6), layout="constrained")
     lines = [f"{key}: {value}" for key, value in provenance().items()] + [""]
     for ax, each in zip(axes.flat, MAPS, strict=True):
-        errors = np.full((len(each.ys), len(each.xs)), np.nan)
-        for (i, y), (j, x) in product(enumerate(each.ys), enumerate(each.xs)):
+        xs, ys = each.xs[::every], each.ys[::every]
+        errors = np.full((len(ys), len(xs)), np.nan)
+        for (i, y), (j, x) in product(enumerate(ys), enumerate(xs)):
             finished = _performed(perform, map_trial(each, x, y))
             error_mm = finished.measures.get("object_error_mm", np.nan)
             lines.append(f"{each.name}: {each.x} {x:g}, {each.y} {y:g}: {_line('', finished).strip()}")
@@ -343,8 +345,8 @@ def _draw_maps(perform: Perform, out: Path) -> None:
             )
         image = ax.imshow(errors, origin="lower", cmap="YlGn_r", norm=LogNorm(0.1, 5.0), alpha=0.8, aspect="auto")
         ax.set(title=each.name, xlabel=each.x, ylabel=each.y)
-        ax.set_xticks(range(len(each.xs)), [f"{x:g}" for x in each.xs])
-        ax.set_yticks(range(len(each.ys)), [f"{y:g}" for y in each.ys])
+        ax.set_xticks(range(len(xs)), [f"{x:g}" for x in xs])
+        ax.set_yticks(range(len(ys)), [f"{y:g}" for y in ys])
     figure.colorbar(image, ax=axes, label="object from its target, mm (done)")
     figure.savefig(out / "pushes.png", dpi=110)
     plt.close(figure)

@@ -102,3 +102,18 @@ def test_the_distance_between_two_edges_is_told_whatever_was_expected() -> None:
     found, width_m = first.between(other)
     assert found.y_m == pytest.approx(0.005)
     assert width_m == pytest.approx(0.07)
+
+
+@given(st.sampled_from([-1.0, 1.0]), st.floats(-0.03, 0.03), st.floats(0.0, 1.5e-3))
+def test_on_a_line_that_is_known_an_edge_is_where_its_distance_says_whatever_its_normal_is_read(
+    left: float, misread: float, depth_m: float
+) -> None:
+    middle, width_m, turned = Pose(0.2, 0.1, -0.2), 0.06, 0.35
+    search = EdgeSearch(Contact(middle.x, middle.y, middle.heading), 0.0, width_m, RADIUS_M, left=left)
+    edge = middle.ahead(left * 0.5 * width_m, 0.5 * math.pi)
+    tip = Pose(edge.x, edge.y, middle.heading - left * turned).ahead(depth_m - RADIUS_M)
+    assert search.edge_on(middle) is None
+    read = Pose(tip.x, tip.y, tip.heading + misread)
+    felt = read.ahead(RADIUS_M - depth_m)
+    search.touched(Contact(felt.x, felt.y, felt.heading, depth_m))
+    assert search.edge_on(middle) == pytest.approx(left * 0.5 * width_m, abs=1e-9)

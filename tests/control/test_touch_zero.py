@@ -77,3 +77,10 @@ def test_a_light_object_that_gives_way_at_the_touch_does_not_seem_to_be_misread(
     zero = TouchZero()
     approach(zero, 5e-3, 1.0, 0.0, 0, 0.9e-3)
     assert zero.error_m == pytest.approx(0.0, abs=0.2e-3)
+
+
+@given(st.floats(3e-3, 8e-3), st.floats(0.7, 1.05), st.sampled_from([0, 9, 18, 27]))
+def test_the_change_per_depth_is_that_of_the_image_and_not_of_the_model(at_m: float, read: float, late_ms: int) -> None:
+    zero = TouchZero()
+    approach(zero, at_m, read, 0.0, late_ms * 1_000_000, 3.5e-3)
+    assert zero.change_per_m == pytest.approx(90.0, rel=0.05)

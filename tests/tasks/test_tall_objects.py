@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
 from touchcell.cell.experiments.pushing import Pushed
 from touchcell.cell.experiments.runner import Scale
 from touchcell.cell.experiments.tall_objects import OBJECTS, SPEC, WITH, held_with_mm, pushed_at_mm
+from touchcell.cell.experiments.trials import Perform
 
 _MDF = 0.3
 _SHEAR_N_MM = 0.4
@@ -40,3 +43,12 @@ def test_the_follower_moves_with_light_round_objects_and_yields_slowly_to_flat_s
     # Friction holds the glass bottle with 1.9 N, more than the 1.8 N of the squeeze.
     assert gains["glass bottle"] == (10, 25, False)
     assert {gains[name] for name in gains.keys() - slow - {"glass bottle"}} == {(10, 25, True)}
+
+
+def test_an_object_that_topples_ends_the_push_as_failed_by_name_before_it_falls(tmp_path: Path) -> None:
+    pytest.importorskip("mujoco")
+    trial = next(each for each in SPEC.trials(Scale(trials=1)) if each.row == "glass bottle, alone, true contact")
+    ended = Perform(SPEC.measure, tmp_path)(trial)
+    assert ended.outcome == "failed"
+    assert "the object topples" in ended.reason
+    assert 6.0 < ended.measures["lean_max_deg"] < 15.0

@@ -79,7 +79,7 @@ class EdgeSearch:
     def edge_on(self, side: Pose) -> float | None:
         """Return where the edge is on a straight side, to the left of a point of it with the side's inward normal.
 
-        None where the distance of the tip's centre does not tell, as of a first contact: the object may have moved since.
+        None where the distance of the tip's centre does not tell, as of a first contact: much has been touched since.
         """
         touch = self._edge_touch
         if touch is None:

@@ -8,6 +8,8 @@ from touchcell.cell.analysis.run_folder import RunFolder, object_poses
 from touchcell.geometry.types import Array
 
 OBJECT = "prism"
+AIM_MM = 0.5
+"""The project's own aim for the distance of a pushed object from its target."""
 
 
 def lean_deg(run: RunFolder) -> Array:

@@ -15,7 +15,7 @@ import numpy as np
 
 from touchcell.cell.analysis.push_errors import push_errors
 from touchcell.cell.analysis.run_folder import RunFolder, during
-from touchcell.cell.experiments.push_measures import OBJECT, lean_deg
+from touchcell.cell.experiments.push_measures import AIM_MM, OBJECT, lean_deg
 from touchcell.cell.experiments.runner import ExperimentSpec, Scale
 from touchcell.cell.experiments.table import Column
 from touchcell.cell.experiments.trials import Finished, Trial
@@ -36,7 +36,7 @@ ESTIMATORS: Mapping[str, Mapping[str, Any] | None] = {"learned": None, "true con
 
 
 COLUMNS = (
-    Column("object_error_mm", "object mm", below=5.0),
+    Column("object_error_mm", "object mm", below=AIM_MM),
     Column("object_error_mm", "worst", "worst"),
     Column("object_heading_error_deg", "heading deg"),
     Column("push_s", "push s", digits=1),
@@ -277,7 +277,7 @@ def _draw(finished: Sequence[Finished], folder: Path) -> list[Path]:
     first = [each for each in finished if each.trial.name.endswith(("mdf_1", "foam_1"))]
     return [
         plot_pushes(first, folder / "pushes.png"),
-        plot_errors(finished, folder / "errors.png", aim_mm=2.0),
+        plot_errors(finished, folder / "errors.png"),
     ]
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from touchcell.cell.analysis.push_errors import pushed_until_s, target_m
 from touchcell.cell.analysis.run_folder import Poses, RunFolder, object_poses, sensor_poses
 from touchcell.cell.experiments.frames import BLUE, ORANGE, frames_2d, label_2d, path_2d, save
-from touchcell.cell.experiments.push_measures import OBJECT, lean_deg
+from touchcell.cell.experiments.push_measures import AIM_MM, OBJECT, lean_deg
 from touchcell.cell.experiments.scenes import scene
 from touchcell.cell.experiments.trials import Finished
 from touchcell.simulation.outlines import ABOVE, SIDE, View, solid_outlines_mm
@@ -34,7 +34,7 @@ def plot_pushes(finished: Sequence[Finished], path: Path, *, view: View = ABOVE)
     return save(figure, path, dpi=80)
 
 
-def plot_errors(finished: Sequence[Finished], path: Path, *, aim_mm: float) -> Path:
+def plot_errors(finished: Sequence[Finished], path: Path) -> Path:
     """Plot every trial's error, by row, with the goal."""
     rows = list(dict.fromkeys(each.trial.row for each in finished))
     figure, axis = plt.subplots(figsize=(0.55 * len(rows) + 3.0, 4.6), layout="constrained")
@@ -48,7 +48,7 @@ def plot_errors(finished: Sequence[Finished], path: Path, *, aim_mm: float) -> P
         axis.plot(np.full(len(errors), i), errors, "o", ms=5, color=colour, alpha=0.75)
         if errors:
             axis.plot([i - 0.25, i + 0.25], [np.mean(errors)] * 2, color="black", lw=1.4)
-    axis.axhline(aim_mm, color=_RED, ls="--", lw=1.0, label=f"aim: {aim_mm:g} mm")
+    axis.axhline(AIM_MM, color=_RED, ls="--", lw=1.0, label=f"aim: {AIM_MM:g} mm")
     axis.set_xticks(range(len(rows)), rows, rotation=40, ha="right", fontsize=8)
     axis.set_ylabel("object to target (mm)")
     axis.set_ylim(bottom=0.0)

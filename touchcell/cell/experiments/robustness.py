@@ -89,7 +89,7 @@ def draw(finished: Sequence[Finished], folder: Path) -> list[Path]:
     from touchcell.cell.experiments.pushing_plots import plot_errors
 
     return [
-        plot_errors(shown, folder / f"errors_{arms.name.replace(' ', '_')}.png", aim_mm=2.0)
+        plot_errors(shown, folder / f"errors_{arms.name.replace(' ', '_')}.png")
         for arms in _ARMS
         if (shown := [each for each in finished if each.trial.row.endswith(arms.name)])
     ]

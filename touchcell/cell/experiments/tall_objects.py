@@ -39,7 +39,8 @@ _FOLLOWER_MM = 3.0
 _SHEAR_N_MM = 0.4
 _SHEAR_MIN_MM, _SHEAR_MAX_MM = 0.5, 2.5
 _SAFETY = 1.1
-_LOST_DEG = 10.0
+# Where a push is given up as toppling (``touchcell.tasks.push_standing``).
+_LOST_DEG = 6.0
 _ROUND = ("cylinder", "bottle")
 # The cell's follower yields laterally but slowly, for objects with flat sides: on these its contact would drift off the
 # line of the push, and the squeeze then turns a light slim one as much as friction on the table resists. The squeeze
@@ -110,7 +111,7 @@ def _cell_changes(pushed: Pushed, arms: str) -> dict[str, Any]:
 
 
 def measure(run: RunFolder) -> Mapping[str, float]:
-    """Return ``pushing.push_measures`` plus ``lost``: leant too far to be pushed on, fallen or not."""
+    """Return ``pushing.push_measures`` plus ``lost``: leant so far that a push is given up, fallen or not."""
     found = push_measures(run)
     return found | {"lost": float(found["lean_max_deg"] > _LOST_DEG)}
 
@@ -168,7 +169,7 @@ SPEC = ExperimentSpec(
     measure=measure,
     columns=(
         Column("toppled", "toppled", "count"),
-        Column("lost", "lean > 10 deg", "count"),
+        Column("lost", "lean > 6 deg", "count"),
         Column("lean_max_deg", "lean deg", "worst", 1),
         Column("error_mm", "error mm", digits=2),
         Column("error_mm", "worst", "worst"),
@@ -180,5 +181,8 @@ SPEC = ExperimentSpec(
         for arms in _ARMS
         for pushed in OBJECTS
     },
-    notes=(ERROR_NOTE, "goals: none of nine topples with the follower, at least seven without"),
+    notes=(
+        ERROR_NOTE,
+        "goals: none of nine leans by 6 deg with the follower, where a push is given up, at least seven without",
+    ),
 )
