@@ -178,6 +178,7 @@ def run(arguments: Sequence[str], out: Path) -> None:
     parser.add_argument("--seeds", type=int, nargs="*", help="these rigs in place of the first")
     parser.add_argument("--before", type=Path, help="pushes.json of an earlier call, to compare with")
     parser.add_argument("--map", action="store_true", help="draw the maps, too")
+    parser.add_argument("--maps", default="", metavar="WORD", help="only maps that have it in their names")
     parser.add_argument("--every", type=int, default=1, metavar="N", help="of each axis of a map only each N-th value")
     parser.add_argument("--tall", action="store_true", help="push tall objects that weigh other than told")
     options = parser.parse_args(arguments)
@@ -193,7 +194,7 @@ def run(arguments: Sequence[str], out: Path) -> None:
             text.append(f"before: {before['provenance']['commit']}")
         (out / "pushes_time.txt").write_text("\n".join([*text, "", *lines]) + "\n")
     if options.map:
-        _draw_maps(perform, out, options.every)
+        _draw_maps(perform, out, [each for each in MAPS if options.maps in each.name], options.every)
     if options.tall:
         _tall(perform, out)
 
@@ -321,16 +322,18 @@ def table(rigs: Sequence[Rig], ended: Mapping[int, Finished]) -> list[str]:
     return lines
 
 
-def _draw_maps(perform: Perform, out: Path, every: int) -> None:
+def _draw_maps(perform: Perform, out: Path, maps: Sequence[Map], every: int) -> None:
     import matplotlib as mpl
 
     mpl.use("Agg")
     from matplotlib import pyplot as plt
     from matplotlib.colors import LogNorm
 
-    figure, axes = plt.subplots(2, 2, figsize=(11, 8.6), layout="constrained")
+    columns = min(len(maps), 2 if len(maps) > 3 else 3)
+    rows = -(-len(maps) // columns)
+    figure, axes = plt.subplots(rows, columns, figsize=(5.5 * columns, 4.3 * rows), layout="constrained", squeeze=False)
     lines = [f"{key}: {value}" for key, value in provenance().items()] + [""]
-    for ax, each in zip(axes.flat, MAPS, strict=True):
+    for ax, each in zip(axes.flat, maps, strict=False):
         xs, ys = each.xs[::every], each.ys[::every]
         errors = np.full((len(ys), len(xs)), np.nan)
         for (i, y), (j, x) in product(enumerate(ys), enumerate(xs)):

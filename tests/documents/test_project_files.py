@@ -25,7 +25,7 @@ def test_one_version() -> None:
 
 def test_the_readme_fits_its_bounds() -> None:
     assert len(README.splitlines()) <= 150
-    assert len(FIGURES) == 5
+    assert len(FIGURES) == 7
 
 
 @pytest.mark.parametrize(("what", "figure", "file"), FIGURES)
