@@ -206,7 +206,7 @@ def matcher_of(model: Model, architecture: MarkerArchitecture) -> MarkerMatcher:
         FirstGuess(
             low=np.array(architecture.guess_low_px),
             cell_px=architecture.guess_cell_px,
-            hidden_weight=model.tensors["guess.hidden.weight"],
+            hidden_weight=np.ascontiguousarray(model.tensors["guess.hidden.weight"].T),
             hidden_bias=model.tensors["guess.hidden.bias"],
             weight=model.tensors["guess.output.weight"],
             bias=model.tensors["guess.output.bias"],

@@ -111,10 +111,11 @@ class Labels(BaseModel):
         if not self.are_contacts:
             return residual
         along = shear_direction(self.centre + self.half_range * mean)
-        values = residual * self.half_range / self.sigma_unit
-        x, y = values[..., 0], values[..., 1]
-        shear = np.stack([along[..., 0] * x + along[..., 1] * y, along[..., 0] * y - along[..., 1] * x], axis=-1)
-        return np.concatenate([shear, values[..., 2:]], axis=-1)
+        values: Array = residual * self.half_range / self.sigma_unit
+        x, y = values[..., 0].copy(), values[..., 1].copy()
+        values[..., 0] = along[..., 0] * x + along[..., 1] * y
+        values[..., 1] = along[..., 0] * y - along[..., 1] * x
+        return values
 
     def xi_gaussian(self, mean: Array, sigma: Array) -> tuple[Array, Array]:
         """Return means (..., 6) and covariances (..., 6, 6) of xi = log(T_s_f), m and rad, of outputs and sigmas."""
