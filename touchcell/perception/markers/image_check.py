@@ -112,20 +112,24 @@ class ImageCheck:
             stray_px=_STRAY * float(np.median(nearest)),
         )
 
-    def find(self, image: ImageArray, mean: NDArray[np.float32]) -> SeenMarkers:
-        """Return the markers of a preprocessed image, of which a network made the six means ``mean``."""
+    def find(self, image: ImageArray, mean: NDArray[np.float32], before: SeenMarkers | None = None) -> SeenMarkers:
+        """Return the markers of a preprocessed image, of which a network made the six means ``mean``.
+
+        ``before`` are those found in this image from means that were farther off.
+        """
         terms = terms_of(mean.astype(np.float64)).astype(np.float32)
         found = self._follow(image, terms)
         if np.count_nonzero(found.seen) >= _ALL_SEEN * len(found.seen):
             off = found.off if found.seen.all() else np.where(found.seen[:, None], found.off, found.around)
             return SeenMarkers(found.expected, off, found.seen, found.light)
-        return self._refined(image, mean.astype(np.float64), found)
+        enough = _WELL_SEEN * len(found.seen) if before is None else np.count_nonzero(before.seen)
+        return self._refined(image, mean.astype(np.float64), found, enough)
 
-    def _refined(self, image: ImageArray, mean: Array, found: kernels.Followed) -> SeenMarkers:
+    def _refined(self, image: ImageArray, mean: Array, found: kernels.Followed, enough: float) -> SeenMarkers:
         """Return the markers found from where another contact near ``mean`` and the modes put them, which sees more."""
         first, contact = found.expected, mean
         found, contact, around = self._settled(image, found, contact)
-        if np.count_nonzero(found.seen) < _WELL_SEEN * len(found.seen):
+        if np.count_nonzero(found.seen) < enough:
             # Missing light looks like another depth, from which a search ends among the wrong markers.
             others = [mean + off * _DEPTH for off in _OTHER_DEPTHS]
             starts = [(self._follow(image, terms_of(other).astype(np.float32)), other) for other in others]
@@ -151,22 +155,19 @@ class ImageCheck:
 
     def _explained(self, contact: Array, off: Array, seen: NDArray[np.bool_]) -> tuple[Array, Array]:
         """Return the contact (6,) and, with it, the field (m, 2) px of modes that explain the seen markers best."""
-        steps = np.concatenate([contact[None], contact + _STEP * np.eye(6)])
-        places = terms_of(steps) @ self._terms
-        slopes = (places[1:] - places[0]) / _STEP
-        known = np.repeat(seen, 2)
-        rows = np.concatenate([self._modes, slopes])[:, known]
-        sd = np.concatenate([self._sd, np.full(6, _CONTACT_SD)])
-        left = (off.ravel() - self._mean)[known]
-        weight = np.ones(len(left))
+        modes = len(self._sd)
+        places = terms_of(np.concatenate([contact[None], contact + _STEP * np.eye(6)])) @ self._terms
+        rows = np.concatenate([self._modes, (places[1:] - places[0]) / _STEP])
+        ridge = np.square(_NOISE_PX / np.concatenate([self._sd, np.full(6, _CONTACT_SD)]))
+        left = off.ravel() - self._mean
+        weight = np.repeat(seen, 2).astype(np.float64)
         for _ in range(_ROBUST):
             weighted = rows * weight
-            moments = weighted @ rows.T + np.diag(np.square(_NOISE_PX / sd))
+            moments = weighted @ rows.T
+            moments.flat[:: len(ridge) + 1] += ridge
             found = np.linalg.solve(moments, weighted @ left)
-            beyond = left - found @ rows
-            weight = 1.0 / (1.0 + np.square(beyond / _WIDE_PX))
-        moved = contact + found[len(self._sd) :]
-        return moved, (self._mean + found[: len(self._sd)] @ self._modes).reshape(-1, 2)
+            weight = np.repeat(seen, 2) / (1.0 + np.square((left - found @ rows) / _WIDE_PX))
+        return contact + found[modes:], (self._mean + found[:modes] @ self._modes).reshape(-1, 2)
 
     def refusal(self, found: SeenMarkers) -> str:
         """Return why an image with these markers cannot be used; empty where it can."""

@@ -126,7 +126,7 @@ class ContactModel:
                 if mended is None:
                     break
                 before, outputs = outputs, self.infer(mended)
-                found = self._check.find(reduced, outputs[:6])
+                found = self._check.find(reduced, outputs[:6], found)
                 if np.abs(outputs - before)[:6].max() < _SETTLED:
                     break
             refusal = self._check.refusal(found)
