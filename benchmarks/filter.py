@@ -208,7 +208,8 @@ def _tracking(seconds: float, network: Path | None) -> list[dict[str, Any]]:
             rows.append(row)
             for what, title in (("estimation", "estimate - true"), ("control", "true - reference")):
                 cells = "".join(f"{row[what][component]:11.3f}" for component in _ORDER)
-                print(f"{row['plate']:<8}{name:<18}{title:<18}{cells}", flush=True)
+                ended = "" if row["outcome"] == "done" else f"  {row['outcome']}"
+                print(f"{row['plate']:<8}{name:<18}{title:<18}{cells}{ended}", flush=True)
     return rows
 
 

@@ -129,7 +129,7 @@ def compare(sequences: list[Observed]) -> list[dict[str, Any]]:
 def show(rows: list[dict[str, Any]]) -> None:
     """Print the rows."""
     names = ("x_mm", "y_mm", "z_mm", "alpha_deg", "beta_deg", "gamma_deg")
-    print(f"\n{'RMS from where the sensor is':<26}{'skin':<10}" + "".join(f"{name:>11}" for name in names), end="")
+    print(f"\n{'RMS, from the sensor':<26}{'skin':<10}" + "".join(f"{name:>11}" for name in names), end="")
     print("   NEES, median    us")
     for row in rows:
         for skin, rms in row["rms"].items():
