@@ -122,7 +122,7 @@ class ImageCheck:
         if np.count_nonzero(found.seen) >= _ALL_SEEN * len(found.seen):
             off = found.off if found.seen.all() else np.where(found.seen[:, None], found.off, found.around)
             return SeenMarkers(found.expected, off, found.seen, found.light)
-        enough = _WELL_SEEN * len(found.seen) if before is None else np.count_nonzero(before.seen)
+        enough = _WELL_SEEN * len(found.seen) if before is None else float(np.count_nonzero(before.seen))
         return self._refined(image, mean.astype(np.float64), found, enough)
 
     def _refined(self, image: ImageArray, mean: Array, found: kernels.Followed, enough: float) -> SeenMarkers:

@@ -257,7 +257,7 @@ class MarkerMatcher:
     def _is_near(self, previous: MarkerField, centres: Array) -> bool:
         """Return True if most markers of the previous frame still have a disc close by."""
         _, square, _ = kernels.pair(self.model.positions(previous.coefficients), centres)
-        return np.count_nonzero(square < self._reach**2) > _STILL_THERE * len(square)
+        return bool(np.count_nonzero(square < self._reach**2) > _STILL_THERE * len(square))
 
     def match_from(self, discs: Discs, starts: Iterable[Array]) -> MarkerField:
         """Return the best of the matches that start from other contacts' coefficients (k,), possibly far off."""
