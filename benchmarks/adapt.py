@@ -1,8 +1,8 @@
 """``touchcell bench adapt``: accuracy over the number of labelled images of another sensor used for adaptation.
 
 One table is of a second real sensor, the other of a simulated one with another camera, mount, stiffness, skin and grip
-than the one that a model was trained on. Images to adapt with are drawn at random, several times; all errors are of
-images that were not among them.
+than the one that a model was trained on. Images to adapt with are drawn at random, several times, but once where they
+are all; errors are of images that were not among them.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ def _rows(case: Case, count: int, seeds: int) -> list[list[str]]:
     measured: list[list[float]] = []
     left_out: dict[str, list[Array]] = {}
     methods = []
-    for seed in range(seeds):
+    for seed in range(seeds if count < total else 1):
         order = np.random.default_rng(seed).permutation(total)
         given, held_out = order[:count], order[max(count, total // 2) :]
         try:

@@ -8,8 +8,8 @@ Five parts, each with a table:
 * ``steps``: one correction by Gauss-Newton, one-step EKF and naively, and one prediction to second and to fourth order,
   run time against error.
 * ``cells``: recordings of shipped cells through the filters and no filter, at equal times, in each component.
-* ``slips``: contacts that move and slip, through the filters: simulated, or with ``--data`` and ``--model`` collected
-  (``data_collection`` with ``motions: sequence``).
+* ``slips``: contacts that move and slip, through the filters: collected ones of ``--data`` and ``--model``, where these
+  are sequences (``data_collection`` with ``motions: sequence``), else simulated.
 * ``tracking``: the shipped cell behind a moving plate, with the static and with the moving surface model in the loop.
 """
 
@@ -91,10 +91,16 @@ def _options(arguments: Sequence[str]) -> argparse.Namespace:
 
 
 def _slips(options: argparse.Namespace) -> list[list[dict[str, Any]]]:
-    if options.data is not None:
-        sets = [filter_slips.collected(options.data, options.split, options.model, options.frame_hz)]
-    else:
-        sets = [filter_slips.simulated(2 * options.orders, seed) for seed in range(options.seeds)]
+    sequences = (
+        []
+        if options.data is None
+        else filter_slips.collected(options.data, options.split, options.model, options.frame_hz)
+    )
+    sets = (
+        [sequences]
+        if sequences
+        else [filter_slips.simulated(2 * options.orders, seed) for seed in range(options.seeds)]
+    )
     tables = []
     for sequences in sets:
         tables.append(filter_slips.compare(sequences))
@@ -202,7 +208,8 @@ def _tracking(seconds: float, network: Path | None) -> list[dict[str, Any]]:
             rows.append(row)
             for what, title in (("estimation", "estimate - true"), ("control", "true - reference")):
                 cells = "".join(f"{row[what][component]:11.3f}" for component in _ORDER)
-                print(f"{row['plate']:<8}{name:<18}{title:<18}{cells}", flush=True)
+                ended = "" if row["outcome"] == "done" else f"  {row['outcome']}"
+                print(f"{row['plate']:<8}{name:<18}{title:<18}{cells}{ended}", flush=True)
     return rows
 
 

@@ -98,16 +98,19 @@ def simulated(sequences: int, seed: int) -> list[Observed]:
 
 
 def collected(data: Path, split: str, model: Path, frame_hz: float) -> list[Observed]:
-    """Return the sequences of a data set; each begins where the tip is in the air.
+    """Return the sequences of a data set, each from the air into contact; none of contacts that were pressed singly.
 
     Raises:
         DataError, ModelError, ImageError: the data set or the model cannot be used.
     """
-    labelled, estimator = read_split(data, split), load_estimator(model)
-    predictions = [estimator.predict(image) for image in labelled.read()]
-    order = sorted(range(len(predictions)), key=lambda i: natural_order(labelled.images[i]))
+    labelled = read_split(data, split)
+    order = sorted(range(len(labelled.images)), key=lambda i: natural_order(labelled.images[i]))
     T_f_s = se3.from_euler_mm_deg(labelled.contact_mm_deg[order])
     touching = T_f_s[:, 2, 3] > 0.0
+    if touching.all():
+        return []
+    estimator = load_estimator(model)
+    predictions = [estimator.predict(image) for image in labelled.read()]
     found = []
     for part in np.split(np.arange(len(order)), np.flatnonzero(np.diff(touching.astype(int))) + 1):
         if len(part) < 2 or not touching[part[0]]:
@@ -126,7 +129,7 @@ def compare(sequences: list[Observed]) -> list[dict[str, Any]]:
 def show(rows: list[dict[str, Any]]) -> None:
     """Print the rows."""
     names = ("x_mm", "y_mm", "z_mm", "alpha_deg", "beta_deg", "gamma_deg")
-    print(f"\n{'RMS from where the sensor is':<26}{'skin':<10}" + "".join(f"{name:>11}" for name in names), end="")
+    print(f"\n{'RMS, from the sensor':<26}{'skin':<10}" + "".join(f"{name:>11}" for name in names), end="")
     print("   NEES, median    us")
     for row in rows:
         for skin, rms in row["rms"].items():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -22,7 +23,7 @@ from touchcell.cell.runtime.compose import compose
 from touchcell.cell.runtime.loop import RunLoop
 from touchcell.geometry import gaussian, se3
 from touchcell.geometry.types import Array
-from touchcell.perception.models.labels import XI_UNITS
+from touchcell.perception.models.labels import CONTACT_NAMES, XI_UNITS
 from touchcell.perception.runtime.estimate import ContactEstimate
 from touchcell.perception.runtime.filter_spec import ContactFilter, FilterSection
 from touchcell.perception.runtime.motion import PoseHistory
@@ -32,6 +33,8 @@ SENSOR_SIGMA = np.array([0.1, 0.1, 0.1, 0.9, 0.9, 0.35]) * XI_UNITS
 """Standard deviations of xi: similar to the shipped network's errors on its simulated validation images."""
 
 _FRAME_NS = 33_333_333
+_DEEPEST_MM = 15.0
+_NOTHING = dict.fromkeys(CONTACT_NAMES, math.nan)
 
 _ACCELERATION = {"accel_mm_s_per_sqrt_s": 15.0, "accel_deg_s_per_sqrt_s": 4.0, "speed_mm_s": 30.0, "speed_deg_s": 5.0}
 
@@ -119,11 +122,9 @@ def track(name: str, *, moving: bool, duration_s: float, seed: int, network: Pat
     cell_file["interlocks"] = {
         k: v for k, v in cell_file["interlocks"].items() if v["kind"] in REQUIRED_OF_ARMS + REQUIRED_OF_SENSORS
     }
-    plate = cell_file["scene"]["surfaces"]["plate"]
-    if moving:
-        plate["motion"]["start_s"] = 0.0
-    else:
-        del plate["motion"]
+    cell_file["interlocks"]["indentation"]["limit_mm"] = _DEEPEST_MM
+    if not moving:
+        del cell_file["scene"]["surfaces"]["plate"]["motion"]
     settings = FILTERS[name]
     estimator = cell_file["sensors"]["sensor"]["estimator"]
     if network is not None:
@@ -146,6 +147,5 @@ def track(name: str, *, moving: bool, duration_s: float, seed: int, network: Pat
         "filter": name,
         "plate": "moving" if moving else "still",
         "outcome": result.outcome.value,
-        "estimation": errors["estimation"]["rms"],
-        "control": errors["control"]["rms"],
+        **{what: errors[what]["rms"] if what in errors else _NOTHING for what in ("estimation", "control")},
     }

@@ -21,11 +21,15 @@ typedef struct {
     int32_t *first, *members;
 } Buckets;
 
-static ptrdiff_t bucket_along(double place, double low, double cell, ptrdiff_t end)
+/* Comparisons rather than floor, fmin and fmax, which are calls on processors of any age. */
+static inline ptrdiff_t bucket_along(double place, double low, double cell, ptrdiff_t end)
 {
-    double at = floor((place - low) / cell);
+    double at = (place - low) / cell;
     return at < 0.0 ? 0 : at >= (double)end ? end - 1 : (ptrdiff_t)at;
 }
+
+static inline double lesser(double a, double b) { return a < b ? a : b; }
+static inline double greater(double a, double b) { return a > b ? a : b; }
 
 static void free_buckets(Buckets *buckets) { free(buckets->first); }
 
@@ -37,12 +41,12 @@ static int fill_buckets(Buckets *buckets, const double *points, ptrdiff_t count)
     for (int axis = 0; axis < 2; axis++) {
         buckets->low[axis] = high[axis] = points[axis];
         for (ptrdiff_t i = 1; i < count; i++) {
-            buckets->low[axis] = fmin(buckets->low[axis], points[2 * i + axis]);
-            high[axis] = fmax(high[axis], points[2 * i + axis]);
+            buckets->low[axis] = lesser(buckets->low[axis], points[2 * i + axis]);
+            high[axis] = greater(high[axis], points[2 * i + axis]);
         }
     }
     double width = high[0] - buckets->low[0], height = high[1] - buckets->low[1];
-    double longer = fmax(fmax(width, height), 1e-9);
+    double longer = greater(greater(width, height), 1e-9);
     ptrdiff_t side = (ptrdiff_t)ceil(sqrt((double)count));
     buckets->cell = longer / (double)side;
     buckets->columns = bucket_along(high[0], buckets->low[0], buckets->cell, side) + 1;
@@ -79,7 +83,7 @@ static int32_t nearest_point(const Buckets *buckets, const double *place, double
     ptrdiff_t v = bucket_along(place[1], buckets->low[1], buckets->cell, buckets->rows);
     double du0 = place[0] - (buckets->low[0] + (double)u * buckets->cell);
     double dv0 = place[1] - (buckets->low[1] + (double)v * buckets->cell);
-    double border = fmin(fmin(du0, buckets->cell - du0), fmin(dv0, buckets->cell - dv0));
+    double border = lesser(lesser(du0, buckets->cell - du0), lesser(dv0, buckets->cell - dv0));
     int32_t best = -1;
     *square = INFINITY;
     for (ptrdiff_t ring = 0;; ring++) {
@@ -101,7 +105,7 @@ static int32_t nearest_point(const Buckets *buckets, const double *place, double
                 }
             }
         }
-        double clear = (double)ring * buckets->cell + fmax(border, 0.0);
+        double clear = (double)ring * buckets->cell + greater(border, 0.0);
         int all = left <= 0 && top <= 0 && right >= buckets->columns - 1 && bottom >= buckets->rows - 1;
         if (all || *square < clear * clear)
             return best;
@@ -183,7 +187,7 @@ WIDE_VECTORS static double shift_places(const Modes *modes, const double *coeffi
                 sum[k] += row[j + k] * coefficients[j + k];
         double shift = (sum[0] + sum[1]) + (sum[2] + sum[3]);
         places[i] += shift;
-        largest = fmax(largest, fabs(shift));
+        largest = greater(fabs(shift), largest);
     }
     return largest;
 }

@@ -93,7 +93,7 @@ def model() -> Model:
         "displacement.basis": moves.basis,
         "displacement.sd": moves.sd,
         "bank": coefficients,
-        "guess.hidden.weight": guess.hidden_weight,
+        "guess.hidden.weight": np.ascontiguousarray(guess.hidden_weight.T),
         "guess.hidden.bias": guess.hidden_bias,
         "guess.output.weight": guess.weight,
         "guess.output.bias": guess.bias,

@@ -54,7 +54,7 @@ def test_what_does_not_show_the_contact_is_refused_with_a_reason(
 
 @pytest.mark.parametrize(
     "change",
-    [each for each in CHANGES if each.wanted == "keep" and "20 %" not in each.name],
+    [each for each in CHANGES if each.wanted == "keep"],
     ids=lambda each: each.name,
 )
 def test_light_noise_dust_and_dead_pins_are_kept_and_estimated_well(

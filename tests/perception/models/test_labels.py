@@ -64,6 +64,24 @@ def test_labels_of_either_kind_round_trip() -> None:
     )
 
 
+@pytest.mark.parametrize(
+    ("mean", "sigma", "covered"),
+    [
+        ([0.9, 0.3, 0.0, 0.0, 0.0, 1.04], [0.0] * 6, True),
+        ([0.9, 0.3, 0.0, 0.0, 0.0, 1.1], [0.0] * 6, False),
+        ([0.9, 0.3, 0.0, 0.0, 0.0, 1.1], [0.0, 0.0, 0.0, 0.0, 0.0, 0.12], True),
+        ([0.0, 0.0, 0.0, 0.0, 0.0, -1.2], [9.0] * 6, False),
+        # The first sigma is along the shear, here along y.
+        ([0.0, 1.1, 0.0, 0.0, 0.0, 0.0], [0.12, 0.0, 0.0, 0.0, 0.0, 0.0], True),
+        ([0.0, 1.1, 0.0, 0.0, 0.0, 0.0], [0.0, 0.12, 0.0, 0.0, 0.0, 0.0], False),
+    ],
+)
+def test_estimates_at_the_border_of_the_range_may_scatter_beyond_it(
+    mean: list[float], sigma: list[float], covered: bool
+) -> None:
+    assert LABELS.cover(np.array(mean), np.array(sigma)) == covered
+
+
 def test_a_contact_without_shear_has_a_direction() -> None:
     np.testing.assert_array_equal(shear_direction(np.zeros((2, 6))), [[1.0, 0.0], [1.0, 0.0]])
     np.testing.assert_allclose(shear_direction(np.array([3.0, -4.0, 1, 0, 0, 0])), [0.6, -0.8])

@@ -14,6 +14,7 @@ functionals those of its displacement model serve.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from touchcell.geometry.types import Array
+from touchcell.perception import kernels
 from touchcell.perception.markers.matching import DisplacementModel
 from touchcell.perception.markers.transfer import lattice_symmetries, symmetric_fields
 from touchcell.perception.models.marker_architecture import CameraCheckSpec
@@ -39,6 +41,7 @@ _ACCEPTED = 0.997
 _OWN, _SPARE_OWN, _SPARE_OWN_FEW = 0.99, 1.2, 8.0
 _TORN = "the markers do not move as those of one tip"
 _NOISE_PX = 0.2
+_LEAST_MISFIT_PX = 1e-6
 
 
 @dataclass(frozen=True)
@@ -74,8 +77,9 @@ class CameraCheck:
         self, functionals: NDArray[np.float32], mean: Array, spacing_px: float, tear: TearCheck | None = None
     ) -> None:
         self._tear = tear
-        self._functionals = functionals
-        self._offset = functionals.astype(np.float64) @ mean
+        self._mean = mean
+        self._rows = np.ascontiguousarray(functionals.T)
+        self._nothing = np.zeros(len(functionals), np.float32)
         self._most_shift_px = _MOST_SHIFT * spacing_px
         self._distinct = functionals[4:].any(axis=1)
 
@@ -86,7 +90,8 @@ class CameraCheck:
 
     def __call__(self, displacements: Array, seen: NDArray[np.bool_]) -> CameraFinding:
         """Check displacements (2 m,) px of one image, of which the markers ``seen`` (m,) were found."""
-        found = np.einsum("ij,j->i", self._functionals, displacements) - self._offset
+        off = (displacements - self._mean).astype(np.float32)
+        found = kernels.affine(self._rows, self._nothing, off)
         u, v, zoom, turn = found[:4].tolist()
         likeness = np.where(self._distinct, found[4:], -np.inf)
         most = int(np.argmax(likeness))
@@ -97,12 +102,12 @@ class CameraCheck:
         return CameraFinding((u, v), zoom, turn, symmetry, refusal)
 
     def _refusal(self, u: float, v: float, zoom: float, turn: float, symmetry: int) -> str:
-        if np.hypot(u, v) > self._most_shift_px:
+        if math.hypot(u, v) > self._most_shift_px:
             return f"the camera's image is shifted by {u:.0f}, {v:.0f} px"
         if abs(zoom) > _MOST_ZOOM:
             return f"the camera's image is zoomed by {100 * zoom:.1f} %"
         if abs(turn) > _MOST_TURN_RAD:
-            return f"the camera is turned by {np.degrees(turn):.1f} deg"
+            return f"the camera is turned by {math.degrees(turn):.1f} deg"
         return describe_symmetry(symmetry)
 
 
@@ -119,22 +124,28 @@ class TearCheck:
     def __init__(
         self, basis: NDArray[np.float32], mean: Array, strength: NDArray[np.float32], spec: CameraCheckSpec
     ) -> None:
-        self._basis, self._mean, self._strength, self._spec = basis, mean, strength, spec
+        self._mean, self._spec, self._components = mean, spec, len(basis)
+        self._rows = np.ascontiguousarray(np.concatenate([basis, strength]).T)
+        self._nothing = np.zeros(self._rows.shape[1], np.float32)
 
     def excess(self, displacements: Array, seen: NDArray[np.bool_]) -> float:
         """Return the logarithm of the misfit over the largest accepted one; positive for a torn image."""
-        off = (displacements - self._mean).astype(np.float32)
-        strength, misfit = _strength_and_misfit(off[None], self._basis, self._strength)
-        visible = max(float(seen.mean()), 0.1)
-        usual = self._spec.misfit[0] + self._spec.misfit[1] * float(strength[0])
-        return float(np.log(misfit[0] / np.sqrt(visible))) - usual - self._spec.most
+        off = displacements - self._mean
+        products = kernels.affine(self._rows, self._nothing, off.astype(np.float32)).astype(np.float64)
+        within, strong = products[: self._components], products[self._components :]
+        # The components are orthonormal: what they leave is the difference of the squares.
+        beyond = max(float(off @ off - within @ within), 0.0)
+        misfit = max(math.sqrt(2.0 * beyond / len(off)), _LEAST_MISFIT_PX)
+        visible = max(np.count_nonzero(seen) / len(seen), 0.1)
+        usual = self._spec.misfit[0] + self._spec.misfit[1] * math.sqrt(float(strong @ strong))
+        return math.log(misfit / math.sqrt(visible)) - usual - self._spec.most
 
 
 def _strength_and_misfit(off: Any, basis: Any, strength: Any) -> tuple[Array, Array]:
     """Return the Mahalanobis norm of the first modes, and the root mean square px per marker beyond the components."""
     beyond = off - np.einsum("nk,kj->nj", np.einsum("nj,kj->nk", off, basis), basis)
     norm = np.linalg.norm(np.einsum("nj,kj->nk", off, strength), axis=1)
-    return norm, np.maximum(np.sqrt(2.0 * np.square(beyond).mean(axis=1)), 1e-6)
+    return norm, np.maximum(np.sqrt(2.0 * np.square(beyond).mean(axis=1)), _LEAST_MISFIT_PX)
 
 
 def strength_rows(model: DisplacementModel) -> NDArray[np.float32]:

@@ -24,7 +24,7 @@ from touchcell.perception.markers.matching import DisplacementModel, FirstGuess,
 from touchcell.perception.markers.transfer import TransferredNetworks
 from touchcell.perception.models.marker_architecture import LOG_PRECISION_BOUNDS, MarkerArchitecture
 from touchcell.perception.models.model_file import Header, Model, load_model
-from touchcell.perception.models.prediction import RANGE_TOLERANCE, Prediction
+from touchcell.perception.models.prediction import Prediction
 
 if TYPE_CHECKING:
     from touchcell.perception.models.camera_change import CameraChange
@@ -149,8 +149,8 @@ class MarkerEstimator:
         refusal = _NO_MARKERS if self.camera is None else self.camera.refusal
         if not field.seen.any():
             return Prediction(*labels.xi_gaussian(mean, sigma), in_range=False, markers=0.0, refusal=refusal)
-        in_range = not refusal and bool(np.all(np.abs(mean) <= 1.0 + RANGE_TOLERANCE))
         calibrated = self.header.calibrated(sigma, mean)
+        in_range = not refusal and labels.cover(mean, calibrated)
         # The networks' sigmas are valid only for markers that were matched, seen by the model's camera.
         xi, covariance = labels.xi_gaussian(mean, np.maximum(calibrated, 1.0) if refusal else calibrated)
         tail_scale = self.header.tail_scale
@@ -206,7 +206,7 @@ def matcher_of(model: Model, architecture: MarkerArchitecture) -> MarkerMatcher:
         FirstGuess(
             low=np.array(architecture.guess_low_px),
             cell_px=architecture.guess_cell_px,
-            hidden_weight=model.tensors["guess.hidden.weight"],
+            hidden_weight=np.ascontiguousarray(model.tensors["guess.hidden.weight"].T),
             hidden_bias=model.tensors["guess.hidden.bias"],
             weight=model.tensors["guess.output.weight"],
             bias=model.tensors["guess.output.bias"],

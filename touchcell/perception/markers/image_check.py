@@ -27,7 +27,14 @@ STRONGEST = 20
 _FARTHEST = 1.15
 _LEAST_SEEN = 0.7
 _ALL_SEEN = 0.985
-_REFINED = 2
+_REFINED = 6
+_STEP = 1e-3
+_DEPTH = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+_WELL_SEEN = 0.85
+_OTHER_DEPTHS = (-0.6, -0.4, -0.2, 0.2, 0.4, 0.6)
+_CONTACT_SD = 0.3
+_ROBUST = 3
+_WIDE_PX = 4.0
 _NOISE_PX = 0.7
 _NEIGHBOURS = 9
 _STRAY = 0.3
@@ -87,6 +94,7 @@ class ImageCheck:
         self._px = px_of_crop(preprocessing)
         self._mean, self._sd = own["mean"], own["sd"].astype(np.float64)
         self._modes = own["modes"].astype(np.float64)
+        self._terms = own["terms"].astype(np.float64)
         self._rows = np.ascontiguousarray(np.concatenate([own["modes"], own["filters"]]).T)
         self._limits = np.array(spec.limits)
         rest = own["rest"].astype(np.float64)
@@ -104,20 +112,62 @@ class ImageCheck:
             stray_px=_STRAY * float(np.median(nearest)),
         )
 
-    def find(self, image: ImageArray, mean: NDArray[np.float32]) -> SeenMarkers:
-        """Return the markers of a preprocessed image, of which a network made the six means ``mean``."""
+    def find(self, image: ImageArray, mean: NDArray[np.float32], before: SeenMarkers | None = None) -> SeenMarkers:
+        """Return the markers of a preprocessed image, of which a network made the six means ``mean``.
+
+        ``before`` are those found in this image from means that were farther off.
+        """
         terms = terms_of(mean.astype(np.float64)).astype(np.float32)
         found = self._follow(image, terms)
+        if np.count_nonzero(found.seen) >= _ALL_SEEN * len(found.seen):
+            off = found.off if found.seen.all() else np.where(found.seen[:, None], found.off, found.around)
+            return SeenMarkers(found.expected, off, found.seen, found.light)
+        enough = _WELL_SEEN * len(found.seen) if before is None else float(np.count_nonzero(before.seen))
+        return self._refined(image, mean.astype(np.float64), found, enough)
+
+    def _refined(self, image: ImageArray, mean: Array, found: kernels.Followed, enough: float) -> SeenMarkers:
+        """Return the markers found from where another contact near ``mean`` and the modes put them, which sees more."""
+        first, contact = found.expected, mean
+        found, contact, around = self._settled(image, found, contact)
+        if np.count_nonzero(found.seen) < enough:
+            # Missing light looks like another depth, from which a search ends among the wrong markers.
+            others = [mean + off * _DEPTH for off in _OTHER_DEPTHS]
+            starts = [(self._follow(image, terms_of(other).astype(np.float32)), other) for other in others]
+            start = max(starts, key=lambda each: np.count_nonzero(each[0].seen))
+            again = self._settled(image, *start)
+            if np.count_nonzero(again[0].seen) > np.count_nonzero(found.seen):
+                found, contact, around = again
+        off = np.where(found.seen[:, None], found.off, around) + found.expected - first
+        return SeenMarkers(first, off, found.seen, found.light)
+
+    def _settled(
+        self, image: ImageArray, found: kernels.Followed, contact: Array
+    ) -> tuple[kernels.Followed, Array, Array]:
+        """Find markers and explain them by turns, while more are seen. Return them, contact (6,), field (m, 2) px."""
         around = found.around
-        if np.count_nonzero(found.seen) < _ALL_SEEN * len(found.seen):
-            for _ in range(_REFINED):
-                again = self._follow(image, terms, self._field(found.off, found.seen))
-                if again.seen.sum() <= found.seen.sum():
-                    break
-                found = again
-            around = self._field(found.off, found.seen)
-        off = found.off if found.seen.all() else np.where(found.seen[:, None], found.off, around)
-        return SeenMarkers(found.expected, off, found.seen, found.light)
+        for _ in range(_REFINED):
+            moved, field = self._explained(contact, found.off, found.seen)
+            again = self._follow(image, terms_of(moved).astype(np.float32), field)
+            if np.count_nonzero(again.seen) <= np.count_nonzero(found.seen):
+                break
+            found, contact, around = again, moved, field
+        return found, contact, around
+
+    def _explained(self, contact: Array, off: Array, seen: NDArray[np.bool_]) -> tuple[Array, Array]:
+        """Return the contact (6,) and, with it, the field (m, 2) px of modes that explain the seen markers best."""
+        modes = len(self._sd)
+        places = terms_of(np.concatenate([contact[None], contact + _STEP * np.eye(6)])) @ self._terms
+        rows = np.concatenate([self._modes, (places[1:] - places[0]) / _STEP])
+        ridge = np.square(_NOISE_PX / np.concatenate([self._sd, np.full(6, _CONTACT_SD)]))
+        left = off.ravel() - self._mean
+        weight = np.repeat(seen, 2).astype(np.float64)
+        for _ in range(_ROBUST):
+            weighted = rows * weight
+            moments = weighted @ rows.T
+            moments.flat[:: len(ridge) + 1] += ridge
+            found = np.linalg.solve(moments, weighted @ left)
+            weight = np.repeat(seen, 2) / (1.0 + np.square((left - found @ rows) / _WIDE_PX))
+        return contact + found[modes:], (self._mean + found[:modes] @ self._modes).reshape(-1, 2)
 
     def refusal(self, found: SeenMarkers) -> str:
         """Return why an image with these markers cannot be used; empty where it can."""
@@ -131,7 +181,11 @@ class ImageCheck:
     def measure(self, found: SeenMarkers) -> Array:
         """Return size and roughness of the field, then how much of each change of the camera it shows."""
         filters = self._rows.shape[1] - len(self._sd)
-        return kernels.measure_field(found.off, self._mean, self._rows, self._sd, STRONGEST, filters)
+        off = found.off
+        if np.count_nonzero(found.seen) < _ALL_SEEN * len(found.seen):
+            # Of the missing ones, what the modes make of the others: whatever else is assumed of them looks rough.
+            off = np.where(found.seen[:, None], off, self._field(off, found.seen))
+        return kernels.measure_field(off, self._mean, self._rows, self._sd, STRONGEST, filters)
 
     def mended(self, image: ImageArray, found: SeenMarkers) -> ImageArray | None:
         """Return the image with its missing markers drawn in; None where next to none are missing, or too many."""

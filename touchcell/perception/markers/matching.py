@@ -132,7 +132,7 @@ class FirstGuess:
     Attributes:
         low: (2,) px, corner of the grid.
         cell_px: side of a cell of the grid.
-        hidden_weight, hidden_bias: (hidden, grid * grid), (hidden,).
+        hidden_weight, hidden_bias: (grid * grid, hidden), (hidden,).
         weight, bias: (k, hidden), (k,); outputs are in standard deviations of the coefficients.
         sd: (k,) px, standard deviation of its errors.
     """
@@ -147,14 +147,14 @@ class FirstGuess:
 
     def density(self, centres: Array) -> NDArray[np.float32]:
         """Return its input (..., grid * grid), the density of discs (..., n, 2)."""
-        grid = math.isqrt(self.hidden_weight.shape[1])
+        grid = math.isqrt(len(self.hidden_weight))
         batch = centres.reshape(-1, *centres.shape[-2:])
         density = disc_density(batch, np.ones(batch.shape[:2]), self.low, self.cell_px, grid)
         return density.reshape(*centres.shape[:-2], -1)
 
     def __call__(self, density: NDArray[np.float32]) -> Array:
         """Return (k,) coefficients over their standard deviations, of a density (grid * grid,)."""
-        hidden = np.maximum(np.einsum("ij,j->i", self.hidden_weight, density) + self.hidden_bias, 0.0)
+        hidden = np.maximum(kernels.affine(self.hidden_weight, self.hidden_bias, density), 0.0)
         guess: Array = (np.einsum("ij,j->i", self.weight, hidden) + self.bias).astype(np.float64)
         return guess
 
@@ -257,7 +257,7 @@ class MarkerMatcher:
     def _is_near(self, previous: MarkerField, centres: Array) -> bool:
         """Return True if most markers of the previous frame still have a disc close by."""
         _, square, _ = kernels.pair(self.model.positions(previous.coefficients), centres)
-        return float(np.mean(square < self._reach**2)) > _STILL_THERE
+        return bool(np.count_nonzero(square < self._reach**2) > _STILL_THERE * len(square))
 
     def match_from(self, discs: Discs, starts: Iterable[Array]) -> MarkerField:
         """Return the best of the matches that start from other contacts' coefficients (k,), possibly far off."""
@@ -285,12 +285,15 @@ class MarkerMatcher:
     def _off(self, coefficients: Array, centres: Array) -> float:
         """Return the median distance px of the predicted markers from their nearest discs."""
         _, square, _ = kernels.pair(self.model.positions(coefficients), centres)
-        return math.sqrt(float(np.median(square)))
+        middle = (len(square) - 1) // 2, len(square) // 2
+        return math.sqrt(0.5 * float(np.partition(square, middle)[list(middle)].sum()))
 
     def _most_similar(self, density: NDArray[np.float32]) -> Array:
         """Return (s, k) coefficients of the learned contacts whose disc density is most similar to this image's."""
         apart = kernels.bytes_apart(self._bank_density, _in_bytes(density))
-        return self._bank[np.argsort(apart)[:_ALIKE]]
+        if len(apart) <= _ALIKE:
+            return self._bank
+        return self._bank[np.argpartition(apart, _ALIKE)[:_ALIKE]]
 
     def _refine(self, start: Array, centres: Array, prior_sd: Array, *, near: bool = False) -> MarkerField:
         ridge = (_FIT_SD_PX / prior_sd) ** 2
@@ -345,12 +348,14 @@ class MarkerMatcher:
         among = 0
         if left_over.any():
             _, apart, _ = kernels.pair(centres[left_over], predicted)
-            among = int((apart < self._spacing_px**2).sum())
+            among = int(np.count_nonzero(apart < self._spacing_px**2))
         margin = 0.5 * self._spacing_px
-        in_view = ((predicted >= margin) & (predicted <= self._size - 1.0 - margin)).all(axis=1)
-        found = int(paired.sum())
-        expected = max(int((in_view | paired).sum()), found + among, 1)
-        rms = float(np.sqrt(square[paired].mean())) if found else np.inf
+        u, v = predicted.T
+        width, height = self._size
+        in_view = (u >= margin) & (u <= width - 1.0 - margin) & (v >= margin) & (v <= height - 1.0 - margin)
+        found = int(np.count_nonzero(paired))
+        expected = max(int(np.count_nonzero(in_view | paired)), found + among, 1)
+        rms = math.sqrt(float(square[paired].mean())) if found else math.inf
         score = found / expected
         return MarkerField(
             positions=positions,

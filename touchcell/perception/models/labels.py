@@ -13,6 +13,7 @@ CONTACT_NAMES = ("x_mm", "y_mm", "z_mm", "alpha_deg", "beta_deg", "gamma_deg")
 XI_UNITS = np.array([1e-3, 1e-3, 1e-3, np.pi / 180, np.pi / 180, np.pi / 180])
 """(6,) SI value of one millimetre or one degree, for every component of xi and of a contact."""
 
+_ALONG_X = np.array([1.0, 0.0])
 _NO_SHEAR_MM = 1e-6
 
 
@@ -53,5 +54,5 @@ def xi_gaussian(contact_mm_deg: Array, covariance: Array) -> tuple[Array, Array]
 def shear_direction(contact_mm_deg: Array) -> Array:
     """Return (..., 2) unit vectors along the shear (x, y) of contacts (..., 6); along x where there is none."""
     shear = np.asarray(contact_mm_deg)[..., :2]
-    size = np.linalg.norm(shear, axis=-1, keepdims=True)
-    return np.where(size > _NO_SHEAR_MM, shear / np.maximum(size, _NO_SHEAR_MM), [1.0, 0.0])
+    size = np.hypot(shear[..., :1], shear[..., 1:])
+    return np.where(size > _NO_SHEAR_MM, shear / np.maximum(size, _NO_SHEAR_MM), _ALONG_X)

@@ -40,6 +40,9 @@ NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 SixNotNegative = tuple[NotNegative, NotNegative, NotNegative, NotNegative, NotNegative, NotNegative]
 
 
+_OUTSIDE = (0.05, 0.15)  # Label half-ranges by which any estimate, and the least certain one, may lie beyond the range.
+
+
 class Labels(BaseModel):
     """Meaning of the outputs, and the training range.
 
@@ -111,10 +114,27 @@ class Labels(BaseModel):
         if not self.are_contacts:
             return residual
         along = shear_direction(self.centre + self.half_range * mean)
-        values = residual * self.half_range / self.sigma_unit
-        x, y = values[..., 0], values[..., 1]
-        shear = np.stack([along[..., 0] * x + along[..., 1] * y, along[..., 0] * y - along[..., 1] * x], axis=-1)
-        return np.concatenate([shear, values[..., 2:]], axis=-1)
+        values: Array = residual * self.half_range / self.sigma_unit
+        x, y = values[..., 0].copy(), values[..., 1].copy()
+        values[..., 0] = along[..., 0] * x + along[..., 1] * y
+        values[..., 1] = along[..., 0] * y - along[..., 1] * x
+        return values
+
+    def cover(self, mean: Array, sigma: Array) -> bool:
+        """Return True where outputs (6,) lie in the training range, or next to it.
+
+        Estimates of contacts at its border scatter about them: outside by no more than one of the standard deviations
+        (6,), and this no less than 0.05 and no more than 0.15 of the half range.
+        """
+        beyond = np.abs(mean) - 1.0
+        if (beyond <= _OUTSIDE[0]).all():
+            return True
+        variance = np.square(sigma)
+        if self.are_contacts:
+            u, v = np.square(shear_direction(self.centre + self.half_range * mean))
+            along, across = variance[:2]
+            variance[:2] = u * along + v * across, v * along + u * across
+        return bool((beyond <= np.clip(np.sqrt(variance), *_OUTSIDE)).all())
 
     def xi_gaussian(self, mean: Array, sigma: Array) -> tuple[Array, Array]:
         """Return means (..., 6) and covariances (..., 6, 6) of xi = log(T_s_f), m and rad, of outputs and sigmas."""

@@ -12,10 +12,6 @@ from touchcell.geometry import se3
 from touchcell.geometry.types import Array, ImageArray
 from touchcell.perception.models.model_file import Header
 
-RANGE_TOLERANCE = 0.05
-"""Tolerance, in label half-ranges, by which a prediction may exceed the training range and still count as inside."""
-
-
 SLIP_RATIO = 0.8
 """Ratio of shear to depth beyond which estimates of shear fall behind the motion, on public data: the skin slips."""
 
@@ -27,8 +23,8 @@ class Prediction:
     Attributes:
         xi: (6,) mean [v, w], m and rad.
         covariance: (6, 6) of xi, m and rad.
-        in_range: the mean lies in the model's training range of labels. Outside it, and out of contact, a prediction is
-            unreliable.
+        in_range: the mean lies in the model's training range (``Labels.cover``). Outside it, and out of contact, a
+            prediction is unreliable.
         markers: fraction of the markers expected in view that were detected, for a marker model.
         tail_scale: factor of the covariance that makes it the scale of a Student-t with four degrees of freedom, as
             which large errors are likelier; None for a Gaussian.

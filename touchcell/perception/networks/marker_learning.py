@@ -288,7 +288,7 @@ def train_guess(
             schedule.step()
     hidden_weight, hidden_bias, weight, bias = (parameter.detach().numpy().copy() for parameter in network.parameters())
     sd = np.sqrt(np.mean(squares[-_LAST_STEPS:], axis=0)) * model.sd
-    return FirstGuess(low, float(cell_px), hidden_weight, hidden_bias, weight, bias, sd)
+    return FirstGuess(low, float(cell_px), np.ascontiguousarray(hidden_weight.T), hidden_bias, weight, bias, sd)
 
 
 def match_all(

@@ -415,7 +415,7 @@ def _tensors(learned: Learned) -> dict[str, NDArray[np.float32]]:
         "displacement.basis": model.basis,
         "displacement.sd": model.sd,
         "bank": learned.bank,
-        "guess.hidden.weight": guess.hidden_weight,
+        "guess.hidden.weight": np.ascontiguousarray(guess.hidden_weight.T),
         "guess.hidden.bias": guess.hidden_bias,
         "guess.output.weight": guess.weight,
         "guess.output.bias": guess.bias,

@@ -16,7 +16,7 @@ from touchcell.perception.markers.image_check import ImageCheck
 from touchcell.perception.models.architecture import Architecture
 from touchcell.perception.models.graph import IMAGES, OUTPUTS, onnx_model
 from touchcell.perception.models.model_file import Header, Model, load_model
-from touchcell.perception.models.prediction import RANGE_TOLERANCE, Prediction
+from touchcell.perception.models.prediction import Prediction
 from touchcell.perception.models.preprocessing import scale
 from touchcell.perception.runtime.marker_texture import MarkerTexture
 
@@ -126,7 +126,7 @@ class ContactModel:
                 if mended is None:
                     break
                 before, outputs = outputs, self.infer(mended)
-                found = self._check.find(reduced, outputs[:6])
+                found = self._check.find(reduced, outputs[:6], found)
                 if np.abs(outputs - before)[:6].max() < _SETTLED:
                     break
             refusal = self._check.refusal(found)
@@ -161,6 +161,7 @@ class ContactModel:
         """Last step of ``predict_reduced``: convert the network's outputs to a Gaussian over xi."""
         mean = output[:6].astype(np.float64)
         sigma = np.exp(-output[6:].astype(np.float64)) if len(output) > 6 else np.ones(6)
-        xi, covariance = self.header.labels.xi_gaussian(mean, self.header.calibrated(sigma, mean))
-        in_range = bool(np.all(np.abs(mean) <= 1.0 + RANGE_TOLERANCE))
-        return Prediction(xi, covariance, in_range, tail_scale=self.header.tail_scale)
+        calibrated = self.header.calibrated(sigma, mean)
+        labels = self.header.labels
+        covered = labels.cover(mean, calibrated)
+        return Prediction(*labels.xi_gaussian(mean, calibrated), covered, tail_scale=self.header.tail_scale)
