@@ -28,10 +28,12 @@ from touchcell.simulation.tip import Tip, TipParameters
 
 _IMAGES_PER_TIP: Final = 32
 _CREASE_RAD: Final = math.radians(30.0)
-_SPREADS: Final = (None, 0.2, 0.07)
-"""Of the ranges, by which a third of the contacts each is scattered about the middle."""
+_SPREADS: Final = np.array([0.0, 0.2, 0.07])
+"""Of the ranges, by which a third of the contacts each is scattered about the middle; zero for evenly."""
 _NEAR_CORNER: Final = 0.35
 _CORNER_RAD: Final = math.radians(15.0)
+_BESIDE_CORNER_M: Final = 14e-3
+"""As far as a tip at a side feels the next one."""
 _ALONG: Final = 0.5
 _ALONG_MM: Final = 0.1
 """Along the edge nothing is felt: a label within a tenth of a millimetre keeps its scale from being zero."""
@@ -62,9 +64,11 @@ class EdgeRanges:
         """Return a random contact (6,) mm and deg."""
         low, high = self.depth_mm
         most = np.array([self.offset_mm, 0.5 * (high - low), self.tilt_deg, self.tilt_deg, self.turn_deg])
-        spread = _SPREADS[rng.integers(len(_SPREADS))]
-        share = rng.uniform(-1.0, 1.0, 5) if spread is None else np.clip(rng.normal(0.0, spread, 5), -1.0, 1.0)
-        offset, depth, alpha, beta, turn = share * most
+        # One spread for all five, or each its own: far off in one alone is what a controller mostly sees.
+        spread = rng.integers(len(_SPREADS), size=5) if rng.random() < 0.5 else rng.integers(len(_SPREADS))
+        sigma = np.broadcast_to(_SPREADS[spread], 5)
+        near = np.clip(sigma * rng.normal(size=5), -1.0, 1.0)
+        offset, depth, alpha, beta, turn = np.where(sigma > 0.0, near, rng.uniform(-1.0, 1.0, 5)) * most
         return np.array([offset, 0.0, depth + 0.5 * (low + high), alpha, beta, turn])
 
     def holds(self, contact_mm_deg: Array) -> bool:
@@ -118,9 +122,18 @@ def _contact(
 
 
 def frame_on_rim(
-    shape: MeshShape, surface: Surface, radius_m: float, rng: np.random.Generator, *, at_corners: float = _NEAR_CORNER
+    shape: MeshShape,
+    surface: Surface,
+    radius_m: float,
+    rng: np.random.Generator,
+    *,
+    at_corners: float = _NEAR_CORNER,
+    beside_corner_m: float = _BESIDE_CORNER_M,
 ) -> Array:
-    """Return the frame {e} (4, 4) of a random point of the rim, near a corner with a probability of ``at_corners``."""
+    """Return the frame {e} (4, 4) of a random point of the rim.
+
+    With a probability of ``at_corners`` it is within ``beside_corner_m`` of a corner, where the part has one.
+    """
     edges = shape.edges
     upper = np.flatnonzero(edges.middle_normals[:, :, 2].max(axis=1) > math.cos(math.radians(50.0)))
     sides = edges.ends - edges.starts
@@ -128,7 +141,11 @@ def frame_on_rim(
         units = sides / np.linalg.norm(sides, axis=1, keepdims=True)
         bends = np.einsum("kc,kc->k", units[upper], np.roll(units[upper], -1, axis=0))
         corners = upper[np.abs(bends) < math.cos(_CORNER_RAD)]
-        upper = corners if len(corners) else upper
+        if len(corners):
+            middles = edges.starts[upper] + 0.5 * sides[upper]
+            corner = edges.ends[rng.choice(corners)]
+            beside = upper[np.linalg.norm(middles - corner, axis=1) < beside_corner_m]
+            upper = beside if len(beside) else corners
     i = int(rng.choice(upper))
     point = edges.starts[i] + rng.random() * sides[i]
     normal = edges.middle_normals[i, edges.middle_normals[i, :, 2].argmax()]
