@@ -124,6 +124,14 @@ def _random_heights(rng: np.random.Generator) -> Callable[[Array], Array]:
         curvature = rng.uniform(-_SHARPEST_CURVATURE_PER_M, _SHARPEST_CURVATURE_PER_M, 2)
         ways = _directions(turns[0] + np.array([0.0, 0.5 * math.pi]))
         return lambda points: 0.5 * _bounded(points @ ways) @ curvature
+    return random_waves(rng, turns)
+
+
+def random_waves(rng: np.random.Generator, turns: Array) -> Callable[[Array], Array]:
+    """Return a function of points (..., 2) m that gives the height (...) m of two waves, along both ``turns`` (2,) rad.
+
+    Where they are tightest, radii are down to 14 mm where both add up and 28 mm along each.
+    """
     per_m = rng.uniform(*_WAVES_PER_M, 2)
     highest_m = np.minimum(0.5 * _SHARPEST_CURVATURE_PER_M / per_m**2, 0.5 * _STEEPEST_WAVE / per_m)
     amplitude_m, phase = rng.uniform(0.0, 2.0, 2) * highest_m, rng.uniform(0.0, 2.0 * math.pi, 2)
