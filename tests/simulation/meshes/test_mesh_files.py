@@ -16,6 +16,7 @@ from touchcell.simulation.meshes.smoothing import TriangleMesh
 
 trimesh = pytest.importorskip("trimesh")
 
+MM = 1e-3
 CELL = """extends: surface_follow_sim.yaml
 name: part
 scene:
@@ -276,3 +277,18 @@ def test_cavities_are_kept_and_a_solid_that_is_inside_out_beside_a_larger_one_is
     with pytest.raises(ConfigError, match="inside out"):
         load_mesh(path, "mm", repair=False)
     assert volume_m3(load_mesh(path, "mm", repair=True)) == pytest.approx(1.125 * volume_m3(BALL))
+
+
+@pytest.mark.parametrize(("beside", "creases"), [((40, 0, 0), 16), ((40, 40, 0), 24)], ids=["a wall", "an edge"])
+def test_solids_that_share_a_wall_or_an_edge_are_closed_by_a_repair(
+    tmp_path: Path, beside: tuple[float, float, float], creases: int
+) -> None:
+    box = primitives.box(np.array([0.04, 0.04, 0.02]))
+    path = export(tmp_path / "two.stl", both(box, TriangleMesh(box.vertices + MM * np.array(beside), box.faces)))
+    with pytest.raises(ConfigError, match="edges of more than two faces"):
+        load_mesh(path, "mm", repair=False)
+    made = load_mesh(path, "mm", repair=True)
+    assert not what_is_open(made)
+    assert volume_m3(made) == pytest.approx(64e-6)
+    # Without those of the seam, whose two sides lie in one plane.
+    assert len(MeshShape(made, 0.5).edges) == creases

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from touchcell.errors import ConfigError
-from touchcell.simulation.meshes.pieces import as_one, has_piece_inside_out, pieces_of
+from touchcell.simulation.meshes.pieces import apart, as_one, has_piece_inside_out, pieces_of
 from touchcell.simulation.meshes.smoothing import Edges, TriangleMesh
 
 Unit = Literal["mm", "m", "inch"]
@@ -203,7 +203,11 @@ def _without_inner_walls(mesh: TriangleMesh) -> TriangleMesh:
 def _repaired(mesh: TriangleMesh) -> TriangleMesh:
     import trimesh
 
-    mesh = _without_inner_walls(_without_empty_faces(_welded(mesh, WELD_M)))
+    mesh = _without_empty_faces(_welded(mesh, WELD_M))
+    edges = Edges.of(mesh.faces)
+    if edges.crowded_count and not edges.open_count and not what_is_open(separate := apart(mesh)):
+        return as_one(separate, touching=True)
+    mesh = _without_inner_walls(mesh)
     made = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     trimesh.repair.fix_winding(made)
     oriented = _as_most_were(mesh, _triangles(made, "m"))

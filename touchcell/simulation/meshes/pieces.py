@@ -33,25 +33,26 @@ def volume_m3(mesh: TriangleMesh) -> float:
     return float(_volumes(mesh).sum())
 
 
-def as_one(mesh: TriangleMesh) -> TriangleMesh:
+def as_one(mesh: TriangleMesh, *, touching: bool = False) -> TriangleMesh:
     """Return a closed mesh with solids that reach into each other made one; ``mesh`` itself where none do.
 
     Of two such solids each has faces inside the other, which nothing touches and on which skin, that reaches below the
-    surface, would be outside. Cavities, whose faces look into a solid, stay as they are.
+    surface, would be outside. Cavities, whose faces look into a solid, stay as they are. With ``touching`` solids
+    that do no more than touch are made one too.
     """
     piece = pieces_of(Edges.of(mesh.faces))
-    numbers, piece = np.unique(piece, return_inverse=True)
+    piece = np.unique(piece, return_inverse=True)[1]
     solid = np.bincount(piece, _volumes(mesh)) > 0.0
-    if len(numbers) == 1 or solid.sum() < 2 or not _may_meet(*_boxes(mesh, piece), solid):
+    if solid.sum() < 2 or not (touching or _may_meet(*_boxes(mesh, piece), solid)):
         return mesh
     from manifold3d import Manifold, Mesh, OpType
 
     solids = []
-    for number in np.flatnonzero(solid):
+    for number in np.flatnonzero(solid).tolist():
         used, faces = np.unique(mesh.faces[piece == number], return_inverse=True)
         solids.append(Manifold(Mesh(mesh.vertices[used].astype(np.float32), faces.reshape(-1, 3).astype(np.uint32))))
     joined = Manifold.batch_boolean(solids, OpType.Add)
-    if sum(each.volume() for each in solids) - joined.volume() <= _SHARED_M3:
+    if not touching and sum(each.volume() for each in solids) - joined.volume() <= _SHARED_M3:
         return mesh
     made: Any = joined.to_mesh()
     cavities = mesh.faces[~solid[piece]]
@@ -61,7 +62,50 @@ def as_one(mesh: TriangleMesh) -> TriangleMesh:
     faces = label.ravel()[faces]
     # Where edges of both meet, faces without area join corners at one place.
     faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
-    return TriangleMesh(vertices, np.ascontiguousarray(faces, dtype=np.int32))
+    # Those that touch along an edge share it now.
+    return apart(TriangleMesh(vertices, np.ascontiguousarray(faces, dtype=np.int32)))
+
+
+def apart(mesh: TriangleMesh) -> TriangleMesh:
+    """Return the mesh with solids that share edges apart: of four faces at an edge, two with a solid between them meet.
+
+    Faces must agree about the outside.
+    """
+    faces = mesh.faces
+    start, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
+    low, high = np.minimum(start, end), np.maximum(start, end)
+    axis = mesh.vertices[high] - mesh.vertices[low]
+    axis /= np.maximum(np.linalg.norm(axis, axis=1, keepdims=True), 1e-300)
+    # A fixed direction across each edge, from which angles about it count.
+    across = np.cross(axis, np.eye(3)[np.abs(axis).argmin(axis=1)])
+    away = mesh.vertices[np.roll(faces, -2, axis=1).ravel()] - mesh.vertices[low]
+    angle = np.arctan2(np.einsum("hc,hc->h", away, np.cross(axis, across)), np.einsum("hc,hc->h", away, across)).round(
+        6
+    )
+    # The solid lies before a face whose edge leads up, and behind one whose edge leads down: first the former.
+    up = start == low
+    order = np.lexsort((~up, angle, high, low))
+    same = np.concatenate([[False], (low[order][1:] == low[order][:-1]) & (high[order][1:] == high[order][:-1])])
+    first = np.maximum.accumulate(np.where(same, 0, np.arange(len(order))))
+    last = np.concatenate([np.flatnonzero(~same)[1:], [len(order)]]) - 1
+    following = np.where(np.isin(np.arange(len(order)), last), first, np.arange(len(order)) + 1)
+    here, there = order, order[following]
+    meets = ~up[here] & up[there]
+    here, there = here[meets], there[meets]
+    # The start of one face's edge is the end of the other's.
+    after = 3 * (np.arange(faces.size) // 3) + (np.arange(faces.size) % 3 + 1) % 3
+    label = np.arange(faces.size)
+    one, other = np.concatenate([here, after[here]]), np.concatenate([after[there], there])
+    while True:
+        least = label.copy()
+        np.minimum.at(least, one, label[other])
+        np.minimum.at(least, other, label[one])
+        least = least[least]
+        if np.array_equal(least, label):
+            break
+        label = least
+    kept, corners = np.unique(label, return_inverse=True)
+    return TriangleMesh(mesh.vertices[start[kept]], np.ascontiguousarray(corners.reshape(-1, 3), dtype=np.int32))
 
 
 def has_piece_inside_out(mesh: TriangleMesh) -> bool:
