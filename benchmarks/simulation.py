@@ -39,11 +39,16 @@ _FINEST_MS = 0.1
 _DYNAMIC_GRID_MS = 5.0
 _CELLS = (
     "surface_follow_sim",
+    "surface_mesh_sim",
     "object_track_sim",
     "single_push_sim",
     "dual_push_sim",
     "dual_push_tall_sim",
 )
+_MESHES: dict[str, dict[str, Any]] = {
+    "surface_mesh_sim": {"saddle": {"kind": "mesh", "file": str(CONFIGS / "meshes" / "saddle.stl"), "unit": "mm"}}
+}
+"""Surfaces that take the place of a cell's own."""
 _PARTS = {
     "touchcell/simulation/render": "images",
     "touchcell/simulation/tip.py": "images",
@@ -173,6 +178,7 @@ def _speeds(*, quick: bool, out: Path) -> dict[str, dict[str, Any]]:
     print(f"{'cell':<22}{'physics':<14}{'arms':<8}{'images':<8}{'x real time':>12}   share of the processor")
     for name in names:
         data = yaml.safe_load(_cell_file(name).read_text())
+        data["scene"]["surfaces"] = _MESHES.get(name, data["scene"].get("surfaces", {}))
         offered = [physics for physics in ("kinematic", "quasi_static", "dynamic") if _fits(physics, data["scene"])]
         for physics in offered:
             for images in (False, True):

@@ -148,7 +148,15 @@ def test_the_bend_of_a_circle_is_one_over_its_radius() -> None:
         x_mm, y_mm = 50.0 * math.cos(angle), 50.0 * math.sin(angle)
         pose = se3.from_euler_mm_deg(np.array([x_mm, y_mm, 0.0, 0.0, 0.0, np.degrees(angle)]))
         bend.update(0.001, pose, np.eye(4))
-    np.testing.assert_allclose(bend.per_m(), [0.0, 1.0, 0.0, 0.0, 0.0, 1.0 / radius_m], atol=1e-3)
+    np.testing.assert_allclose(bend.per_m(), [0.0, 1.0, 0.0, 0.0, 0.0, 1.0 / radius_m], rtol=0.02, atol=1e-3)
+
+
+def test_a_corner_that_is_felt_in_several_steps_is_no_bend() -> None:
+    bend = CurvatureEstimator(0.005)
+    for i, felt_deg in enumerate([0.0, 0.0, 0.0, 0.0, 11.0, 22.0, 33.0, 44.0, 44.0, 44.0, 44.0, 44.0, 44.0, 44.0]):
+        pose = se3.from_euler_mm_deg(np.array([0.0, 0.4 * i, 0.0, 0.0, 0.0, felt_deg]))
+        bend.update(0.0004, pose, np.eye(4))
+    assert abs(bend.per_m()[5]) < 1.0
 
 
 def twisted(behavior: FollowEdge, lean_rad_per_m: float, tilt_deg: float = 0.0) -> np.ndarray:
@@ -167,7 +175,7 @@ def twisted(behavior: FollowEdge, lean_rad_per_m: float, tilt_deg: float = 0.0) 
 
 def test_a_face_that_leans_over_takes_the_tip_across_the_edge() -> None:
     V = twisted(FollowEdge(EdgeFollowingConfig()), lean_rad_per_m=20.0)
-    np.testing.assert_allclose(V, [-0.020 * 0.6, 0.030, 0.0, 0.0, 0.6, 0.0], atol=2e-3)
+    np.testing.assert_allclose(V, [-0.020 * 0.6, 0.030, 0.0, 0.0, 0.6, 0.0], rtol=0.02, atol=2e-3)
 
 
 def test_a_tip_goes_slower_where_a_face_leans_over_fast_and_while_it_is_tilted() -> None:

@@ -15,6 +15,10 @@ from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 
 _FEWEST: Final = 5
+_NOISE_M: Final = 0.3e-3
+"""A spread of the way that tells as much of the motion as knowing it to be zero."""
+_TIGHTEST_PER_M: Final = 1.0 / 6e-3
+"""A corner that is felt in several steps, for no bend of what is followed is tighter."""
 _CORNER_RAD: Final = math.radians(12.0)
 """From one estimate to the next: no bend but a corner, behind which nothing is known of the bend."""
 
@@ -43,7 +47,7 @@ class CurvatureEstimator:
         T_base_f = se3.compose(T_base_sensor, T_s_f)
         if self._T_base_f is not None:
             moved = se3.log(se3.compose(se3.inverse(self._T_base_f), T_base_f))
-            if float(np.linalg.norm(moved[3:])) > _CORNER_RAD:
+            if float(np.linalg.norm(moved[3:])) > _CORNER_RAD or np.linalg.norm(self.per_m()[3:]) > _TIGHTEST_PER_M:
                 self._samples.clear()
             self._moved = self._moved + moved
         self._T_base_f = T_base_f
@@ -61,6 +65,6 @@ class CurvatureEstimator:
         way = np.array([each for each, _ in self._samples])
         moved = np.stack([each for _, each in self._samples])
         off = way - way.mean()
-        spread = float(off @ off)
-        slope: Array = off @ (moved - moved.mean(axis=0)) / spread if spread > 1e-12 else np.zeros(6)
+        spread = float(off @ off) + len(way) * _NOISE_M**2
+        slope: Array = off @ (moved - moved.mean(axis=0)) / spread
         return slope

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
@@ -28,10 +29,17 @@ from touchcell.simulation.tip import Tip, TipParameters
 
 _IMAGES_PER_TIP: Final = 32
 _CREASE_RAD: Final = math.radians(30.0)
-_SPREADS: Final = (None, 0.2, 0.07)
-"""Of the ranges, by which a third of the contacts each is scattered about the middle."""
+_SPREADS: Final = np.array([0.0, 0.2, 0.07])
+"""Of the ranges, by which a third of the contacts each is scattered about the middle; zero for evenly."""
 _NEAR_CORNER: Final = 0.35
+_PAST_CORNER: Final = 0.3
+_PAST_MM: Final = (-3.0, 6.0)
+_PAST_MEAN: Final = (0.0, 0.0, 3.0, 0.0, 0.0)
+_PAST_SPREAD: Final = (1.2, 0.0, 0.7, 3.0, 3.0)
+"""Offset, way along the edge, depth and both tilts, mm and deg, of a tip that glides past a corner."""
 _CORNER_RAD: Final = math.radians(15.0)
+_BESIDE_CORNER_M: Final = 14e-3
+"""As far as a tip at a side feels the next one."""
 _ALONG: Final = 0.5
 _ALONG_MM: Final = 0.1
 """Along the edge nothing is felt: a label within a tenth of a millimetre keeps its scale from being zero."""
@@ -54,7 +62,7 @@ class EdgeRanges:
     offset_mm: float = 8.0
     depth_mm: tuple[float, float] = (0.2, 7.0)
     tilt_deg: float = 25.0
-    turn_deg: float = 75.0
+    turn_deg: float = 78.0
     shear_mm: float = 6.0
     torsion_deg: float = 8.0
 
@@ -62,9 +70,11 @@ class EdgeRanges:
         """Return a random contact (6,) mm and deg."""
         low, high = self.depth_mm
         most = np.array([self.offset_mm, 0.5 * (high - low), self.tilt_deg, self.tilt_deg, self.turn_deg])
-        spread = _SPREADS[rng.integers(len(_SPREADS))]
-        share = rng.uniform(-1.0, 1.0, 5) if spread is None else np.clip(rng.normal(0.0, spread, 5), -1.0, 1.0)
-        offset, depth, alpha, beta, turn = share * most
+        # One spread for all five, or each its own: far off in one alone is what a controller mostly sees.
+        spread = rng.integers(len(_SPREADS), size=5) if rng.random() < 0.5 else rng.integers(len(_SPREADS))
+        sigma = np.broadcast_to(_SPREADS[spread], 5)
+        near = np.clip(sigma * rng.normal(size=5), -1.0, 1.0)
+        offset, depth, alpha, beta, turn = np.where(sigma > 0.0, near, rng.uniform(-1.0, 1.0, 5)) * most
         return np.array([offset, 0.0, depth + 0.5 * (low + high), alpha, beta, turn])
 
     def holds(self, contact_mm_deg: Array) -> bool:
@@ -102,8 +112,12 @@ def _contact(
     """Return T_e_s (4, 4) and pixels (markers, 2) of a contact within the ranges."""
     surface, radius_m = Surface(shape), law.tip_radius_m
     while True:
-        T_world_e = frame_on_rim(shape, surface, radius_m, rng)
-        T_world_s = se3.compose(T_world_e, se3.from_euler_mm_deg(ranges.drawn(rng)))
+        past = _past_corner(shape, surface, radius_m, rng) if rng.random() < _PAST_CORNER else None
+        if past is None:
+            T_world_e = frame_on_rim(shape, surface, radius_m, rng)
+            T_world_s = se3.compose(T_world_e, se3.from_euler_mm_deg(ranges.drawn(rng)))
+        else:
+            T_world_e, T_world_s = past
         # Beside corners and on bends the edge that the tip feels is not the one that it was placed at.
         felt = nearest_edge([surface], T_world_s, 0.0, radius_m)
         assert felt is not None
@@ -118,19 +132,65 @@ def _contact(
 
 
 def frame_on_rim(
-    shape: MeshShape, surface: Surface, radius_m: float, rng: np.random.Generator, *, at_corners: float = _NEAR_CORNER
+    shape: MeshShape,
+    surface: Surface,
+    radius_m: float,
+    rng: np.random.Generator,
+    *,
+    at_corners: float = _NEAR_CORNER,
+    beside_corner_m: float = _BESIDE_CORNER_M,
 ) -> Array:
-    """Return the frame {e} (4, 4) of a random point of the rim, near a corner with a probability of ``at_corners``."""
+    """Return the frame {e} (4, 4) of a random point of the rim.
+
+    With a probability of ``at_corners`` it is within ``beside_corner_m`` of a corner, where the part has one.
+    """
+    edges = shape.edges
+    upper, corners = _corners(shape)
+    if rng.random() < at_corners and len(corners):
+        middles = 0.5 * (edges.starts[upper] + edges.ends[upper])
+        corner = edges.ends[rng.choice(corners)]
+        beside = upper[np.linalg.norm(middles - corner, axis=1) < beside_corner_m]
+        upper = beside if len(beside) else corners
+    return _frame_at(shape, surface, radius_m, int(rng.choice(upper)), float(rng.random()))
+
+
+def _past_corner(
+    shape: MeshShape, surface: Surface, radius_m: float, rng: np.random.Generator
+) -> tuple[Array, Array] | None:
+    """Return T_world_e (4, 4) beside a random corner and T_world_s (4, 4) of a tip that glides past it, or turns there.
+
+    None for a part without corners. So does a controller: a corner is felt when the tip is beyond it.
+    """
+    upper, corners = _corners(shape)
+    if not len(corners):
+        return None
+    before = int(rng.choice(corners))
+    after = int(upper[(int(np.searchsorted(upper, before)) + 1) % len(upper)])
+    onwards = rng.random() < 0.5
+    T_world_e = _frame_at(shape, surface, radius_m, *((before, 0.999) if onwards else (after, 0.001)))
+    edges = shape.edges
+    side = edges.ends[before] - edges.starts[before] if onwards else edges.starts[after] - edges.ends[after]
+    way = T_world_e[:3, 1] * np.sign(T_world_e[:3, 1] @ side)
+    T_world_a = T_world_e.copy()
+    T_world_a[:3, 3] += 1e-3 * rng.uniform(*_PAST_MM) * way
+    turn = rng.uniform(-90.0, 90.0) if rng.random() < 0.6 else rng.normal(0.0, 8.0)
+    scattered_mm_deg = rng.normal(_PAST_MEAN, _PAST_SPREAD)
+    return T_world_e, se3.compose(T_world_a, se3.from_euler_mm_deg(np.append(scattered_mm_deg, turn)))
+
+
+def _corners(shape: MeshShape) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the pieces of the rim of a part, and those of them that end at a corner."""
     edges = shape.edges
     upper = np.flatnonzero(edges.middle_normals[:, :, 2].max(axis=1) > math.cos(math.radians(50.0)))
-    sides = edges.ends - edges.starts
-    if rng.random() < at_corners:
-        units = sides / np.linalg.norm(sides, axis=1, keepdims=True)
-        bends = np.einsum("kc,kc->k", units[upper], np.roll(units[upper], -1, axis=0))
-        corners = upper[np.abs(bends) < math.cos(_CORNER_RAD)]
-        upper = corners if len(corners) else upper
-    i = int(rng.choice(upper))
-    point = edges.starts[i] + rng.random() * sides[i]
+    sides = edges.ends[upper] - edges.starts[upper]
+    units = sides / np.linalg.norm(sides, axis=1, keepdims=True)
+    bends = np.einsum("kc,kc->k", units, np.roll(units, -1, axis=0))
+    return upper, upper[np.abs(bends) < math.cos(_CORNER_RAD)]
+
+
+def _frame_at(shape: MeshShape, surface: Surface, radius_m: float, i: int, share: float) -> Array:
+    edges = shape.edges
+    point = edges.starts[i] + share * (edges.ends[i] - edges.starts[i])
     normal = edges.middle_normals[i, edges.middle_normals[i, :, 2].argmax()]
     T_world_s = np.eye(4)
     T_world_s[:3, :3] = _with_z(-normal)

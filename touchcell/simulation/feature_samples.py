@@ -86,7 +86,8 @@ def _on_part(
 ) -> Array | None:
     """Return (markers, 2) px of a contact with a part, or None where what was drawn is of no or another class."""
     radius_m = law.tip_radius_m
-    T_world_e = frame_on_rim(part, surface, radius_m, rng, at_corners=1.0 if wanted == "corner" else 0.0)
+    at_corners = 1.0 if wanted == "corner" else 0.0
+    T_world_e = frame_on_rim(part, surface, radius_m, rng, at_corners=at_corners, beside_corner_m=_AT_CORNER_M)
     contact = _RANGES.drawn(rng)
     if wanted == "surface":
         contact[0] = -1e3 * rng.uniform(_ON_SURFACE_M, _FARTHEST_M)

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Mapping
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -16,13 +16,16 @@ from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 from touchcell.input_file import InputFile
 from touchcell.plugin_section import PluginSection
+from touchcell.simulation.combine import Operation, Part, combined
 from touchcell.simulation.meshes import primitives
 from touchcell.simulation.meshes.hollows import hollows
 from touchcell.simulation.meshes.load import INSTALL, SUFFIXES, Unit, load_mesh, mesh_library, what_is_open
 from touchcell.simulation.meshes.mesh_shape import MeshShape
 from touchcell.simulation.meshes.smoothing import TriangleMesh
+from touchcell.simulation.motions import Still
 from touchcell.simulation.shape_drawing import Drawable
 from touchcell.simulation.shape_spec import SURFACES, SurfaceConfig, SurfaceSpec
+from touchcell.simulation.surfaces import Surface
 
 _LIBRARIES = {"trimesh": INSTALL}
 _SOLIDS = {**_LIBRARIES, "manifold3d": INSTALL}
@@ -218,16 +221,14 @@ class CombinedConfig(MeshSurfaceConfig):
             found.update(part.modules())
         return found
 
-    def _combined(self, operation: Literal["union", "intersection", "difference"]) -> TriangleMesh:
+    def _combined(self, operation: Operation) -> TriangleMesh:
         with mesh_library("parts", ""):
-            import manifold3d  # noqa: F401  without it trimesh starts Blender
-            import trimesh
-        solids = [_solid(name, part, trimesh) for name, part in self.parts.items()]
-        made: Any = trimesh.boolean.boolean_manifold(solids, operation)
-        if not len(made.faces):
+            import manifold3d  # noqa: F401
+        made = combined([_solid(name, part) for name, part in self.parts.items()], operation)
+        # Parts that do no more than touch leave faces back to back.
+        if not len(made.faces) or what_is_open(made):
             raise ConfigError(f"the {operation} of its parts is empty", key="parts", hint="move the parts")
-        made.merge_vertices()
-        return TriangleMesh(np.array(made.vertices, np.float64), np.array(made.faces, np.int32))
+        return made
 
 
 class UnionConfig(CombinedConfig):
@@ -260,24 +261,21 @@ class DifferenceConfig(CombinedConfig):
         return self._combined("difference")
 
 
-def _solid(name: str, part: SurfaceConfig, trimesh: Any) -> Any:
+def _solid(name: str, part: SurfaceConfig) -> Part:
     key = f"parts.{name}"
     if part.motion is not None:
         raise ConfigError("a part does not move by itself", key=f"{key}.motion", hint="give the motion to the whole")
     try:
-        shape = part if isinstance(part, MeshSurfaceConfig) else part.shape()
-        mesh = shape.mesh() if isinstance(shape, MeshSurfaceConfig) else _mesh_of(shape)
+        shape = part.shape()
+        mesh = shape.drawn() if isinstance(shape, Drawable) else None
     except ConfigError as error:
         raise ConfigError(error.reason, key=f"{key}.{error.key}", value=error.value, hint=error.hint) from None
     if mesh is None or what_is_open(mesh):
         hint = "use a box, cylinder, sphere, superquadric, extrusion or a closed mesh"
         raise ConfigError(f"a {part.kind} encloses no volume", key=key, value=part.kind, hint=hint)
     T = se3.from_euler_mm_deg(part.pose_mm_deg)
-    return trimesh.Trimesh(mesh.vertices @ T[:3, :3].T + T[:3, 3], mesh.faces, process=False)
-
-
-def _mesh_of(shape: object) -> TriangleMesh | None:
-    return shape.drawn() if isinstance(shape, Drawable) else None
+    placed = TriangleMesh(mesh.vertices @ T[:3, :3].T + T[:3, 3], mesh.faces)
+    return Part(placed, Surface(shape, Still(T)))
 
 
 def _table(file: str) -> Array:

@@ -18,6 +18,8 @@ _OUTWARDS_M: Final = (0.0, 2e-3, 5e-3, 9e-3, 14e-3, 20e-3, 28e-3, 40e-3)
 _INNERMOST: Final = 0.15
 _BLUNTEST_RAD: Final = math.radians(50.0)
 _SHARPEST_RAD: Final = math.radians(35.0)
+_DOWN_M: Final = (3e-3, 7e-3, 12e-3, 18e-3, _WALL_M)
+_WALL_PER_M: Final = 45.0
 _NARROWEST: Final = 0.15
 """Size of a part's foot, as a share of its face."""
 _SHARPEST_CURVATURE_PER_M: Final = 36.0
@@ -29,28 +31,31 @@ def random_part(rng: np.random.Generator) -> TriangleMesh:
     """Return a part whose rim is an edge between a face above and a wall below; its face looks towards +z.
 
     A third of the faces are flat, the others bend both ways or are waves, with radii down to 28 mm. Half of the walls
-    lean, more of them as a bowl's do. Outlines are circles, waves round a circle, drops with one sharp end, polygons
-    and stars; three in ten are the rims of holes.
+    lean, more of them as a bowl's do, and most of these bend. Outlines are circles, waves round a circle, drops with
+    one sharp end, polygons and stars; three in ten are the rims of holes.
     """
     hole = bool(rng.random() < 0.3)
     outline = _outline(rng, hole=hole)
     heights = _random_heights(rng)
     # Walls that lean under the face are as sharp as those of thin plates; blunt ones are those of bowls.
     lean = rng.uniform(-_BLUNTEST_RAD, _SHARPEST_RAD) * (rng.random() < 0.5)
+    wall_per_m = rng.uniform(-_WALL_PER_M, _WALL_PER_M) * (lean != 0.0 and rng.random() < 0.6)
+    down = np.array(_DOWN_M)[::-1]
+    under = (math.tan(lean) * down + 0.5 * wall_per_m * down**2)[:, None, None]
     length = np.linalg.norm(outline, axis=1, keepdims=True)
     middle = outline[rng.integers(len(outline))]
     if hole:
         rings = np.stack([outline * (1.0 + away / length) for away in _OUTWARDS_M])
-        wall = outline * np.maximum(1.0 + math.tan(lean) * _WALL_M / length, _NARROWEST)
+        wall = outline * np.maximum(1.0 + under / length, _NARROWEST)
     else:
         shares = 1.0 - np.array(_INWARDS_M) / max(float(length.max()), _INWARDS_M[-1] / (1.0 - _INNERMOST))
         rings = outline * shares[:, None, None]
-        wall = outline * np.maximum(1.0 - math.tan(lean) * _WALL_M / length, _NARROWEST)
+        wall = outline * np.maximum(1.0 - under / length, _NARROWEST)
     # Bent about a point of the rim, so that it stays a height over the plane however large the part is.
     face = np.concatenate([rings, heights(rings - middle)[..., None]], axis=2)
-    foot = np.concatenate([wall, face[0, :, 2:] - _WALL_M], axis=1)
-    count, rows = len(outline), len(face) + 1
-    vertices = np.concatenate([foot[None], face]).reshape(-1, 3)
+    below = np.concatenate([wall, face[:1, :, 2:] - down[:, None, None]], axis=2)
+    count, rows = len(outline), len(face) + len(below)
+    vertices = np.concatenate([below, face]).reshape(-1, 3)
     faces = grid_faces(rows, count, closed=True)
     if hole:
         return TriangleMesh(vertices, np.ascontiguousarray(faces[:, ::-1]))
@@ -124,6 +129,14 @@ def _random_heights(rng: np.random.Generator) -> Callable[[Array], Array]:
         curvature = rng.uniform(-_SHARPEST_CURVATURE_PER_M, _SHARPEST_CURVATURE_PER_M, 2)
         ways = _directions(turns[0] + np.array([0.0, 0.5 * math.pi]))
         return lambda points: 0.5 * _bounded(points @ ways) @ curvature
+    return random_waves(rng, turns)
+
+
+def random_waves(rng: np.random.Generator, turns: Array) -> Callable[[Array], Array]:
+    """Return a function of points (..., 2) m that gives the height (...) m of two waves, along both ``turns`` (2,) rad.
+
+    Where they are tightest, radii are down to 14 mm where both add up and 28 mm along each.
+    """
     per_m = rng.uniform(*_WAVES_PER_M, 2)
     highest_m = np.minimum(0.5 * _SHARPEST_CURVATURE_PER_M / per_m**2, 0.5 * _STEEPEST_WAVE / per_m)
     amplitude_m, phase = rng.uniform(0.0, 2.0, 2) * highest_m, rng.uniform(0.0, 2.0 * math.pi, 2)

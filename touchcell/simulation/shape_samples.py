@@ -1,8 +1,8 @@
 """Random contacts of randomised simulated sensors with curved surfaces and ridges, by Algorithm 1 of the paper.
 
 The paper presses on a plane. Here a fifth of the surfaces are planes, the others bend both ways, as far as a tip of
-20 mm fits into them, and a third of those have a ridge. The label is the pose of the sensor in the surface frame {f} at
-the nearest point, as on a plane.
+20 mm fits into them, or are waves, whose bend changes under the tip; a third of those have a ridge. The label is the
+pose of the sensor in the surface frame {f} at the nearest point, as on a plane.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from touchcell.simulation.contact import ContactLaw, about_z
 from touchcell.simulation.meshes.mesh_shape import MeshShape
 from touchcell.simulation.meshes.primitives import height_field
 from touchcell.simulation.pressed import pressed
+from touchcell.simulation.random_parts import random_waves
 from touchcell.simulation.samples import SampledContact, Variation, scattered
 from touchcell.simulation.surfaces import Plane, Surface
 from touchcell.simulation.tip import Tip, TipParameters
@@ -27,6 +28,8 @@ from touchcell.simulation.tip import Tip, TipParameters
 _IMAGES_PER_TIP: Final = 32
 _PLANES: Final = 0.2
 _RIDGES: Final = 0.35
+_WAVES: Final = 0.35
+"""Of the bent surfaces, to which ridges come on top."""
 _SPACING_M: Final = 1.5e-3
 _POINTS: Final = 47
 _HOLLOW_PER_M: Final = 1.0 / 0.028
@@ -59,7 +62,10 @@ def shape_contacts(
 
 
 def random_curved_surface(rng: np.random.Generator, *, ridges: float = 0.0) -> Surface:
-    """Return a plane or a surface that bends both ways; a share of ``ridges`` of those has a ridge in its middle."""
+    """Return a plane, a surface that bends both ways, or waves.
+
+    A share of ``ridges`` of those that are no plane has a ridge in its middle.
+    """
     if rng.random() < _PLANES:
         return Surface(Plane())
     # Convex is negative: heights fall away from the middle.
@@ -71,6 +77,9 @@ def random_curved_surface(rng: np.random.Generator, *, ridges: float = 0.0) -> S
     x, y = np.meshgrid(side, side)
     u, v = math.cos(turn) * x + math.sin(turn) * y, math.cos(turn) * y - math.sin(turn) * x
     heights = 0.5 * (curvature[0] * u * u + curvature[1] * v * v)
+    if rng.random() < _WAVES:
+        ways = turn + np.array([0.0, rng.uniform(0.25, 0.75) * math.pi])
+        heights = random_waves(rng, ways)(np.stack([x, y], axis=2))
     # A ridge runs along rows or columns of the grid, so that it is as sharp as its edges.
     heights -= slope * np.abs(y if along_x else x)
     return Surface(MeshShape(height_field(heights, _SPACING_M), _CREASE_RAD))

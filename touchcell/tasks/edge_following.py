@@ -34,6 +34,8 @@ _AXES: Final = {
 
 _BEND_SHARE: Final = 0.6
 """Of the largest turn that a bend may take, so that corrections have the rest."""
+_HALF_SPEED_RAD: Final = math.radians(2.5)
+"""The tilt at which the speed is halved. Estimates of an edge scatter more than those of a surface."""
 _NO_EDGE_S: Final = 0.1
 """Without an edge before anything is followed: three frames, before the controller goes where it seems to be."""
 _STILL_RAD: Final = math.radians(45.0)
@@ -149,7 +151,7 @@ class FollowEdge:
         speed = min(self._speed_m_s, _BEND_SHARE * self._fastest_rad_s / max(float(np.linalg.norm(bend[3:])), 1e-9))
         speed *= max(math.cos(min(abs(turn) / _STILL_RAD, 1.0) * 0.5 * math.pi), 0.0)
         if self._tilts and T_s_f is not None:
-            speed *= slower_by_tilt(T_s_f)
+            speed *= slower_by_tilt(T_s_f, _HALF_SPEED_RAD)
         self._feedforward = speed * bend
         self._feedforward[1] = self._sign * speed
         if self._close_loop:

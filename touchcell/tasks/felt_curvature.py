@@ -24,7 +24,7 @@ _SHORTEST_M: Final = 2e-3
 """The way that is remembered at least."""
 _SHARE: Final = 0.4
 """Of the largest turn that a bend may take, so that corrections have the rest."""
-_HALF_SPEED_RAD: Final = math.radians(2.5)
+_HALF_SPEED_RAD: Final = math.radians(1.5)
 """The tilt at which the speed is halved: a bend that nothing has announced, as at a crease."""
 
 
@@ -108,7 +108,7 @@ class CurvedWay:
         R = T_base_sensor[:3, :3]
         normal, slower = R[:, 2], 1.0
         if T_s_f is not None:
-            normal, slower = R @ T_s_f[:3, 2], slower_by_tilt(T_s_f)
+            normal, slower = R @ T_s_f[:3, 2], slower_by_tilt(T_s_f, _HALF_SPEED_RAD)
             self._curvature.update(T_base_sensor[:3, 3], normal)
         turn = R.T @ self._curvature.turn_rad_per_m(R @ direction, normal)
         bend = float(np.linalg.norm(turn))
@@ -117,7 +117,10 @@ class CurvedWay:
         return self.twist
 
 
-def slower_by_tilt(T_s_f: Array) -> float:
-    """Return the share of the speed that a sensor may have while it is tilted against a contact (4, 4)."""
+def slower_by_tilt(T_s_f: Array, half_rad: float) -> float:
+    """Return the share of the speed that a sensor may have while it is tilted against a contact (4, 4).
+
+    It is a half at a tilt of ``half_rad``.
+    """
     tilt = math.acos(min(max(float(T_s_f[2, 2]), -1.0), 1.0))
-    return 1.0 / (1.0 + (tilt / _HALF_SPEED_RAD) ** 3)
+    return 1.0 / (1.0 + (tilt / half_rad) ** 3)

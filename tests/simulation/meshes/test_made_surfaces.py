@@ -1,5 +1,6 @@
 """Surfaces that are made: extrusions, superquadrics, height fields, and solids of solids."""
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ for library in ("trimesh", "manifold3d", "shapely", "mapbox_earcut"):
     pytest.importorskip(library)
 
 MM = 1e-3
+LENS = {"upper": -40, "lower": 40}
 
 
 def shape_of(**section: Any) -> Shape:
@@ -100,3 +102,37 @@ def test_a_solid_of_solids_is_closed() -> None:
     )
     edges = Edges.of(shape.drawn().faces)  # type: ignore[attr-defined]
     assert (edges.open_count, edges.crowded_count, edges.flipped_count) == (0, 0, 0)
+
+
+def test_a_rim_lies_on_the_surfaces_of_its_parts_and_has_their_normals_and_curvature() -> None:
+    halves = {side: {"kind": "sphere", "radius_mm": 60, "pose_mm_deg": [0, 0, z, 0, 0, 0]} for side, z in LENS.items()}
+    lens = shape_of(kind="intersection", parts=halves)
+    rim_mm = math.sqrt(60.0**2 - 40.0**2)
+    starts = lens.edges.starts  # type: ignore[attr-defined]
+    assert np.allclose(1e3 * np.linalg.norm(starts[:, :2], axis=1), rim_mm, atol=2e-4)
+    assert np.allclose(starts[:, 2], 0.0, atol=1e-6)
+    for angle in np.linspace(0.0, 6.0, 13):
+        # 0.3 mm beside the rim, 4 mm above the upper face.
+        way = np.array([math.cos(angle), math.sin(angle), 0.0])
+        outward = np.array([0.0, 0.0, 40e-3]) + (rim_mm - 0.3) * MM * way
+        outward /= np.linalg.norm(outward)
+        found = lens.nearest(np.array([0.0, 0.0, -40e-3]) + 64e-3 * outward)
+        assert found.distance_m == pytest.approx(4e-3, abs=1e-6)
+        assert math.degrees(math.acos(min(1.0, float(found.normal @ outward)))) < 0.05
+        assert found.curvatures_per_m == pytest.approx((1 / 60e-3, 1 / 60e-3), rel=0.02)
+
+
+def test_parts_that_share_planes_of_symmetry_can_be_parts_again() -> None:
+    ball = {"kind": "sphere", "radius_mm": 40}
+    post = {"kind": "cylinder", "radius_mm": 20, "height_mm": 80}
+    cut = {"kind": "box", "size_mm": [100, 100, 50], "pose_mm_deg": [0, 0, 20, 0, 0, 0]}
+    both = {"kind": "union", "parts": {"ball": ball, "post": post}}
+    edges = Edges.of(shape_of(kind="difference", parts={"both": both, "cut": cut}).drawn().faces)  # type: ignore[attr-defined]
+    assert (edges.open_count, edges.crowded_count, edges.flipped_count) == (0, 0, 0)
+
+
+def test_parts_that_only_touch_have_nothing_in_common() -> None:
+    low = {"kind": "box", "size_mm": [40, 80, 20]}
+    high = {"kind": "box", "size_mm": [60, 60, 60], "pose_mm_deg": [0, 0, 20, 0, 0, 0]}
+    (problem,) = problems_of(kind="intersection", parts={"low": low, "high": high})
+    assert (problem.key, problem.reason) == ("surfaces.it.parts", "the intersection of its parts is empty")

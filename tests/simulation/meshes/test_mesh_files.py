@@ -9,12 +9,14 @@ from touchcell.cell.config.schema import plan_cell
 from touchcell.cell.config.yaml_file import InvalidCell
 from touchcell.errors import ConfigError
 from touchcell.simulation.meshes import primitives
-from touchcell.simulation.meshes.load import load_mesh, volume_m3, what_is_open
+from touchcell.simulation.meshes.load import load_mesh, what_is_open
 from touchcell.simulation.meshes.mesh_shape import MeshShape
+from touchcell.simulation.meshes.pieces import volume_m3
 from touchcell.simulation.meshes.smoothing import TriangleMesh
 
 trimesh = pytest.importorskip("trimesh")
 
+MM = 1e-3
 CELL = """extends: surface_follow_sim.yaml
 name: part
 scene:
@@ -247,3 +249,46 @@ def test_an_ascii_stl_in_inches_is_as_large_as_the_binary_one_in_millimetres(tmp
     (tmp_path / "ball.stl").write_text(trimesh.exchange.stl.export_stl_ascii(made))
     mesh = load_mesh(tmp_path / "ball.stl", "inch", repair=False)
     assert np.ptp(mesh.vertices, axis=0).max() == pytest.approx(0.08, abs=1e-5)
+
+
+def both(one: TriangleMesh, other: TriangleMesh) -> TriangleMesh:
+    faces = np.concatenate([one.faces, other.faces + len(one.vertices)])
+    return TriangleMesh(np.concatenate([one.vertices, other.vertices]), faces)
+
+
+def test_solids_that_reach_into_each_other_are_named_and_made_one_by_a_repair(tmp_path: Path) -> None:
+    beside = TriangleMesh(BALL.vertices + np.array([0.05, 0.0, 0.0]), BALL.faces)
+    path = export(tmp_path / "two.stl", both(BALL, beside))
+    with pytest.raises(ConfigError, match="reach into each other") as caught:
+        load_mesh(path, "mm", repair=False)
+    assert (caught.value.key, caught.value.hint) == ("file", "`repair: true` makes them one")
+    joined = load_mesh(path, "mm", repair=True)
+    assert not what_is_open(joined)
+    lens_m3 = volume_m3(TriangleMesh(BALL.vertices, BALL.faces)) * (1.0 - 0.625) ** 2 * (2.0 + 0.625) / 2.0
+    assert volume_m3(joined) == pytest.approx(2.0 * volume_m3(BALL) - lens_m3, rel=0.01)
+
+
+def test_cavities_are_kept_and_a_solid_that_is_inside_out_beside_a_larger_one_is_named(tmp_path: Path) -> None:
+    small = TriangleMesh(0.5 * BALL.vertices, np.ascontiguousarray(BALL.faces[:, ::-1]))
+    hollow = load_mesh(export(tmp_path / "hollow.stl", both(BALL, small)), "mm", repair=False)
+    assert volume_m3(hollow) == pytest.approx(0.875 * volume_m3(BALL))
+    beside = TriangleMesh(small.vertices + np.array([0.07, 0.0, 0.0]), small.faces)
+    path = export(tmp_path / "beside.stl", both(BALL, beside))
+    with pytest.raises(ConfigError, match="inside out"):
+        load_mesh(path, "mm", repair=False)
+    assert volume_m3(load_mesh(path, "mm", repair=True)) == pytest.approx(1.125 * volume_m3(BALL))
+
+
+@pytest.mark.parametrize(("beside", "creases"), [((40, 0, 0), 16), ((40, 40, 0), 24)], ids=["a wall", "an edge"])
+def test_solids_that_share_a_wall_or_an_edge_are_closed_by_a_repair(
+    tmp_path: Path, beside: tuple[float, float, float], creases: int
+) -> None:
+    box = primitives.box(np.array([0.04, 0.04, 0.02]))
+    path = export(tmp_path / "two.stl", both(box, TriangleMesh(box.vertices + MM * np.array(beside), box.faces)))
+    with pytest.raises(ConfigError, match="edges of more than two faces"):
+        load_mesh(path, "mm", repair=False)
+    made = load_mesh(path, "mm", repair=True)
+    assert not what_is_open(made)
+    assert volume_m3(made) == pytest.approx(64e-6)
+    # Without those of the seam, whose two sides lie in one plane.
+    assert len(MeshShape(made, 0.5).edges) == creases

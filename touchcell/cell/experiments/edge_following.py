@@ -45,6 +45,8 @@ _QUICK: Final = ("circle", "square")
 _HEIGHT_MM: Final = 20.0
 _RIM_MM: Final = 45.0
 _INSIDE_MM: Final = 2.0
+_INSIDE_RIM_MM: Final = 0.5
+"""On a face that leans its edge is not told from its middle farther inside."""
 _CORNER_DEG: Final = 20.0
 _CORNER_S: Final = 0.35
 
@@ -115,7 +117,7 @@ def surface_of(name: str) -> dict[str, Any]:
 
 
 def start_pose_mm_deg(name: str) -> list[float]:
-    """Return a pose 5 mm above a shape and 2 mm inside its edge, with x across the edge and away from the face."""
+    """Return a pose 5 mm above a face and 2 mm or less inside its edge, with x across the edge, away from the face."""
     raised = _HEIGHT_MM + 25.0
     if name == "circle":
         return [50.0 - _INSIDE_MM, 0.0, raised, 180.0, 0.0, 0.0]
@@ -123,8 +125,13 @@ def start_pose_mm_deg(name: str) -> list[float]:
         # The face beside its inner rim lies outside: x leads inwards.
         return [40.0 + _INSIDE_MM, 0.0, raised, 180.0, 0.0, 180.0]
     if name in RIMS:
-        height = float(HEIGHTS_MM[name](np.array([_RIM_MM]), np.zeros(1))[0])
-        return [_RIM_MM - _INSIDE_MM, 0.0, height + 25.0, 180.0, 0.0, 0.0]
+        # Towards the face, as `touchcell check` asks for.
+        x = _RIM_MM - _INSIDE_RIM_MM + np.array([-0.1, 0.0, 0.1])
+        low, height, high = HEIGHTS_MM[name](x, np.zeros(3)).tolist()
+        lean = math.atan2(high - low, 0.2)
+        away = np.array([-math.sin(lean), math.cos(lean)])
+        over = np.array([_RIM_MM - _INSIDE_RIM_MM, height]) + 25.0 * away
+        return [float(over[0]), 0.0, float(over[1]), 180.0, -float(np.degrees(lean)), 0.0]
     outline = OUTLINES_MM[name]
     # In the middle of a piece near the first third, away from corners of shapes that begin with one.
     i = len(outline) // 3

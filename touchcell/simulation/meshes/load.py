@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from touchcell.errors import ConfigError
+from touchcell.simulation.meshes.pieces import apart, as_one, has_piece_inside_out, pieces_of
 from touchcell.simulation.meshes.smoothing import Edges, TriangleMesh
 
 Unit = Literal["mm", "m", "inch"]
@@ -89,7 +90,9 @@ def load_mesh(path: Path, unit: Unit, *, scale: float = 1.0, repair: bool) -> Tr
     loaded.merge_vertices(merge_tex=True, merge_norm=True)
     mesh = _without_empty_faces(_triangles(loaded, unit))
     if repair:
-        return with_thickness(_repaired(mesh), SHEET_M)
+        mesh = with_thickness(_repaired(mesh), SHEET_M)
+        with mesh_library("file", str(path)):
+            return mesh if what_is_open(mesh) else as_one(mesh)
     if problem := what_is_open(mesh):
         raise ConfigError(
             f"does not enclose a volume: {problem}",
@@ -98,9 +101,13 @@ def load_mesh(path: Path, unit: Unit, *, scale: float = 1.0, repair: bool) -> Tr
             hint="`repair: true` welds corners, closes small holes and orients the faces; what stays open becomes a "
             "wall of 0.2 mm, which can be touched from both sides",
         )
-    if volume_m3(mesh) < 0.0:
+    if has_piece_inside_out(mesh):
         hint = "`repair: true` turns its faces round"
         raise ConfigError("is inside out: its normals point inwards", key="file", value=str(path), hint=hint)
+    with mesh_library("file", str(path)):
+        if as_one(mesh) is not mesh:
+            hint = "`repair: true` makes them one"
+            raise ConfigError("has solids that reach into each other", key="file", value=str(path), hint=hint)
     return mesh
 
 
@@ -113,12 +120,6 @@ def what_is_open(mesh: TriangleMesh) -> str:
         (edges.flipped_count, "edges whose faces disagree about the outside"),
     )
     return ", ".join(f"{count} {what}" for count, what in counts if count)
-
-
-def volume_m3(mesh: TriangleMesh) -> float:
-    """Return the enclosed volume, negative for a mesh that is inside out."""
-    a, b, c = (mesh.vertices[mesh.faces[:, i]] - mesh.vertices[0] for i in range(3))
-    return float(np.einsum("mc,mc->", a, np.cross(b, c)) / 6.0)
 
 
 def _require_whole_stl(path: Path) -> None:
@@ -178,16 +179,35 @@ def _triangles(loaded: Any, unit: Unit) -> TriangleMesh:
 
 
 def _without_empty_faces(mesh: TriangleMesh) -> TriangleMesh:
+    """Drop faces without area, and those that are there twice the same way round."""
     a, b, c = mesh.faces.T
     kept = mesh.faces[(a != b) & (b != c) & (c != a)]
-    _, first = np.unique(np.sort(kept, axis=1), axis=0, return_index=True)
+    turned = np.take_along_axis(kept, (kept.argmin(axis=1)[:, None] + np.arange(3)) % 3, axis=1)
+    _, first = np.unique(turned, axis=0, return_index=True)
     return TriangleMesh(mesh.vertices, np.ascontiguousarray(kept[np.sort(first)]))
+
+
+def _without_inner_walls(mesh: TriangleMesh) -> TriangleMesh:
+    """Drop faces that lie back to back: both, as between solids that touch, or one of two, of a sheet drawn twice."""
+    _, first, same, times = np.unique(
+        np.sort(mesh.faces, axis=1), axis=0, return_index=True, return_inverse=True, return_counts=True
+    )
+    if times.max() == 1:
+        return mesh
+    solid = TriangleMesh(mesh.vertices, np.ascontiguousarray(mesh.faces[times[same.ravel()] == 1]))
+    if len(solid.faces) and not what_is_open(solid):
+        return solid
+    return TriangleMesh(mesh.vertices, np.ascontiguousarray(mesh.faces[np.sort(first)]))
 
 
 def _repaired(mesh: TriangleMesh) -> TriangleMesh:
     import trimesh
 
     mesh = _without_empty_faces(_welded(mesh, WELD_M))
+    edges = Edges.of(mesh.faces)
+    if edges.crowded_count and not edges.open_count and not what_is_open(separate := apart(mesh)):
+        return as_one(separate, touching=True)
+    mesh = _without_inner_walls(mesh)
     made = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     trimesh.repair.fix_winding(made)
     oriented = _as_most_were(mesh, _triangles(made, "m"))
@@ -212,7 +232,7 @@ def _welded(mesh: TriangleMesh, distance_m: float) -> TriangleMesh:
 
 def _as_most_were(before: TriangleMesh, after: TriangleMesh) -> TriangleMesh:
     """Turn round each piece of ``after`` most of whose area was the other way round ``before``; their order is one."""
-    piece, faces = _pieces(Edges.of(after.faces)), after.faces.copy()
+    piece, faces = pieces_of(Edges.of(after.faces)), after.faces.copy()
     kept = np.einsum("mc,mc->m", before.face_normals(), after.face_normals())
     area = np.sign(kept) * np.sqrt(np.abs(kept))
     turned = np.bincount(piece, weights=area)[piece] < 0.0
@@ -228,7 +248,7 @@ def with_thickness(mesh: TriangleMesh, thickness_m: float) -> TriangleMesh:
     edges = Edges.of(mesh.faces)
     if not edges.open_count:
         return mesh
-    piece, open_edge = _pieces(edges), edges.other < 0
+    piece, open_edge = pieces_of(edges), edges.other < 0
     sheets = ~_nearly_closed(mesh, piece, open_edge)[piece]
     if not sheets.any():
         return mesh
@@ -280,7 +300,7 @@ def _nearly_closed(mesh: TriangleMesh, piece: NDArray[np.int64], open_edge: NDAr
 def _with_outside_out(mesh: TriangleMesh) -> TriangleMesh:
     """Turn round each piece that is inside out, but for sheets, which have no inside."""
     edges = Edges.of(mesh.faces)
-    piece, faces = _pieces(edges), mesh.faces.copy()
+    piece, faces = pieces_of(edges), mesh.faces.copy()
     for number in np.unique(piece[_nearly_closed(mesh, piece, edges.other < 0)[piece]]):
         own = piece == number
         corners = mesh.vertices[mesh.faces[own]]
@@ -288,20 +308,6 @@ def _with_outside_out(mesh: TriangleMesh) -> TriangleMesh:
         if float(np.einsum("mc,mc->", a, np.cross(b, c))) < 0.0:
             faces[own] = faces[own][:, ::-1]
     return TriangleMesh(mesh.vertices, np.ascontiguousarray(faces))
-
-
-def _pieces(edges: Edges) -> NDArray[np.int64]:
-    """Return (m,) a number for each face, the same for faces that edges connect."""
-    face, edge = np.nonzero(edges.other >= 0)
-    other = edges.other[face, edge]
-    label = np.arange(len(edges.other))
-    while True:
-        least = label.copy()
-        np.minimum.at(least, face, label[other])
-        least = least[least]
-        if np.array_equal(least, label):
-            return label
-        label = least
 
 
 def _with_holes_closed(mesh: TriangleMesh) -> TriangleMesh:

@@ -33,10 +33,13 @@ class TriangleMesh:
     Attributes:
         vertices: (n, 3) m.
         faces: (m, 3) indices of vertices, counter-clockwise seen from outside.
+        normals: (m, 3, 3) unit normals at the corners of the faces, NaN where nothing but the faces tells; None where
+            nothing does anywhere.
     """
 
     vertices: Array
     faces: Indices
+    normals: Array | None = None
 
     def face_normals(self) -> Array:
         """Return (m, 3) normals, twice as long as the faces' areas."""
@@ -118,13 +121,15 @@ def smooth(mesh: TriangleMesh, crease_rad: float) -> SmoothMesh:
     area = np.linalg.norm(doubled, axis=1)
     normal = doubled / np.maximum(area, 1e-300)[:, None]
 
-    cos = np.einsum("mec,mc->me", normal[edges.other], normal)
+    told = mesh.normals if mesh.normals is not None and crease_rad > 0.0 else np.full((len(faces), 3, 3), np.nan)
+    cos = np.einsum("mec,mc->me", *_facing(normal, told, edges.other))
     is_smooth = (edges.other >= 0) & (cos >= np.cos(crease_rad) - 1e-12)
     neighbours = np.where(is_smooth, edges.other, -1).astype(np.int32)
 
     group = _groups(faces, neighbours, edges.other_edge)
     normals = _corner_normals(vertices, faces, normal, area, group)
     normals = _on_borders(vertices, faces, normal, area, normals, group, neighbours)
+    normals = _as_told(normals, told, group)
     bends = _corner_bends(vertices, faces, normal, area, normals, group)
 
     edge_normals = np.where((edges.other >= 0)[..., None], normal[edges.other] + normal[:, None], normal[:, None])
@@ -134,6 +139,29 @@ def smooth(mesh: TriangleMesh, crease_rad: float) -> SmoothMesh:
         angle = np.arctan2(area, np.einsum("mc,mc->m", a, b))
         np.add.at(vertex_normals, faces[:, i], angle[:, None] * normal)
     return SmoothMesh(mesh, normals, bends, neighbours, edge_normals, vertex_normals)
+
+
+def _facing(normal: Array, told: Array, other: Indices) -> tuple[Array, Array]:
+    """Return the normals of the faces across each edge (m, 3, 3) and of the faces (m, 3), to tell how they meet.
+
+    Slivers of a cut face anywhere: where the normals at all corners of a face are told, it faces as they do.
+    """
+    mean = told.mean(axis=1)
+    faces = np.where(np.isfinite(mean).all(axis=1, keepdims=True), mean, normal)
+    faces = faces / np.maximum(np.linalg.norm(faces, axis=1, keepdims=True), 1e-300)
+    return faces[other], faces
+
+
+def _as_told(normals: Array, told: Array, group: NDArray[np.int64]) -> Array:
+    """Return the corner normals (m, 3, 3) with those of groups that are told in their place: their mean."""
+    known = np.isfinite(told).all(axis=2)
+    if not known.any():
+        return normals
+    total = np.zeros((group.size, 3))
+    np.add.at(total, group[known.ravel()], told[known])
+    length = np.linalg.norm(total, axis=1)
+    mean = (total / np.maximum(length, 1e-300)[:, None])[group].reshape(-1, 3, 3)
+    return np.ascontiguousarray(np.where((length[group] > 0.0).reshape(-1, 3, 1), mean, normals))
 
 
 def _groups(faces: Indices, neighbours: Indices, other_edge: Indices) -> NDArray[np.int64]:

@@ -1,0 +1,142 @@
+"""Pieces of a mesh: those that reach into each other, and how they become one. Needs the extra ``mesh``."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from touchcell.geometry.types import Array
+from touchcell.simulation.meshes.smoothing import Edges, TriangleMesh
+
+_SHARED_M3: Final = 1e-9
+_APART_M: Final = 1e-6
+
+
+def pieces_of(edges: Edges) -> NDArray[np.int64]:
+    """Return (m,) a number for each face, the same for faces that edges connect."""
+    face, edge = np.nonzero(edges.other >= 0)
+    other = edges.other[face, edge]
+    label = np.arange(len(edges.other))
+    while True:
+        least = label.copy()
+        np.minimum.at(least, face, label[other])
+        least = least[least]
+        if np.array_equal(least, label):
+            return label
+        label = least
+
+
+def volume_m3(mesh: TriangleMesh) -> float:
+    """Return the enclosed volume, negative for a mesh that is inside out."""
+    return float(_volumes(mesh).sum())
+
+
+def as_one(mesh: TriangleMesh, *, touching: bool = False) -> TriangleMesh:
+    """Return a closed mesh with solids that reach into each other made one; ``mesh`` itself where none do.
+
+    Of two such solids each has faces inside the other, which nothing touches and on which skin, that reaches below the
+    surface, would be outside. Cavities, whose faces look into a solid, stay as they are. With ``touching`` solids
+    that do no more than touch are made one too.
+    """
+    piece = pieces_of(Edges.of(mesh.faces))
+    piece = np.unique(piece, return_inverse=True)[1]
+    solid = np.bincount(piece, _volumes(mesh)) > 0.0
+    if solid.sum() < 2 or not (touching or _may_meet(*_boxes(mesh, piece), solid)):
+        return mesh
+    from manifold3d import Manifold, Mesh, OpType
+
+    solids = []
+    for number in np.flatnonzero(solid).tolist():
+        used, faces = np.unique(mesh.faces[piece == number], return_inverse=True)
+        solids.append(Manifold(Mesh(mesh.vertices[used].astype(np.float32), faces.reshape(-1, 3).astype(np.uint32))))
+    joined = Manifold.batch_boolean(solids, OpType.Add)
+    if not touching and sum(each.volume() for each in solids) - joined.volume() <= _SHARED_M3:
+        return mesh
+    made: Any = joined.to_mesh()
+    cavities = mesh.faces[~solid[piece]]
+    vertices = np.concatenate([np.asarray(made.vert_properties, np.float64)[:, :3], mesh.vertices])
+    faces = np.concatenate([np.asarray(made.tri_verts, np.int64), cavities + len(made.vert_properties)])
+    vertices, label = np.unique(vertices, axis=0, return_inverse=True)
+    faces = label.ravel()[faces]
+    # Where edges of both meet, faces without area join corners at one place.
+    faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
+    # Those that touch along an edge share it now.
+    return apart(TriangleMesh(vertices, np.ascontiguousarray(faces, dtype=np.int32)))
+
+
+def apart(mesh: TriangleMesh) -> TriangleMesh:
+    """Return the mesh with solids that share edges apart: of four faces at an edge, two with a solid between them meet.
+
+    Faces must agree about the outside.
+    """
+    faces = mesh.faces
+    start, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
+    low, high = np.minimum(start, end), np.maximum(start, end)
+    axis = mesh.vertices[high] - mesh.vertices[low]
+    axis /= np.maximum(np.linalg.norm(axis, axis=1, keepdims=True), 1e-300)
+    # A fixed direction across each edge, from which angles about it count.
+    across = np.cross(axis, np.eye(3)[np.abs(axis).argmin(axis=1)])
+    away = mesh.vertices[np.roll(faces, -2, axis=1).ravel()] - mesh.vertices[low]
+    angle = np.arctan2(np.einsum("hc,hc->h", away, np.cross(axis, across)), np.einsum("hc,hc->h", away, across)).round(
+        6
+    )
+    # The solid lies before a face whose edge leads up, and behind one whose edge leads down: first the former.
+    up = start == low
+    order = np.lexsort((~up, angle, high, low))
+    same = np.concatenate([[False], (low[order][1:] == low[order][:-1]) & (high[order][1:] == high[order][:-1])])
+    first = np.maximum.accumulate(np.where(same, 0, np.arange(len(order))))
+    last = np.concatenate([np.flatnonzero(~same)[1:], [len(order)]]) - 1
+    following = np.where(np.isin(np.arange(len(order)), last), first, np.arange(len(order)) + 1)
+    here, there = order, order[following]
+    meets = ~up[here] & up[there]
+    here, there = here[meets], there[meets]
+    # The start of one face's edge is the end of the other's.
+    after = 3 * (np.arange(faces.size) // 3) + (np.arange(faces.size) % 3 + 1) % 3
+    label = np.arange(faces.size)
+    one, other = np.concatenate([here, after[here]]), np.concatenate([after[there], there])
+    while True:
+        least = label.copy()
+        np.minimum.at(least, one, label[other])
+        np.minimum.at(least, other, label[one])
+        least = least[least]
+        if np.array_equal(least, label):
+            break
+        label = least
+    kept, corners = np.unique(label, return_inverse=True)
+    return TriangleMesh(mesh.vertices[start[kept]], np.ascontiguousarray(corners.reshape(-1, 3), dtype=np.int32))
+
+
+def has_piece_inside_out(mesh: TriangleMesh) -> bool:
+    """Return True if a closed mesh has a piece whose faces look inwards and that is no cavity of another."""
+    _, piece = np.unique(pieces_of(Edges.of(mesh.faces)), return_inverse=True)
+    solid = np.bincount(piece, _volumes(mesh)) > 0.0
+    low, high = _boxes(mesh, piece)
+    return any(
+        not ((low[solid] < low[i]).all(axis=1) & (high[solid] > high[i]).all(axis=1)).any()
+        for i in np.flatnonzero(~solid)
+    )
+
+
+def _volumes(mesh: TriangleMesh) -> Array:
+    """Return (m,) of the tetrahedron between each face and a point of the mesh."""
+    a, b, c = (mesh.vertices[mesh.faces[:, i]] - mesh.vertices[0] for i in range(3))
+    volumes: Array = np.einsum("mc,mc->m", a, np.cross(b, c)) / 6.0
+    return volumes
+
+
+def _boxes(mesh: TriangleMesh, piece: NDArray[np.int64]) -> tuple[Array, Array]:
+    """Return lowest and highest coordinates (k, 3) m of each piece."""
+    count = int(piece.max()) + 1
+    low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
+    np.minimum.at(low, piece, mesh.vertices[mesh.faces].min(axis=1))
+    np.maximum.at(high, piece, mesh.vertices[mesh.faces].max(axis=1))
+    return low, high
+
+
+def _may_meet(low: Array, high: Array, solid: NDArray[np.bool_]) -> bool:
+    low, high = low[solid] + _APART_M, high[solid]
+    return any(
+        bool(((low[i] < high[i + 1 :]) & (low[i + 1 :] < high[i])).all(axis=1).any()) for i in range(len(low) - 1)
+    )
