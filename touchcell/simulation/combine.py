@@ -65,7 +65,8 @@ def combined(parts: Sequence[Part], operation: Operation) -> TriangleMesh:
         return TriangleMesh(np.empty((0, 3)), np.empty((0, 3), np.int32))
     vertices, label = np.unique(np.asarray(made.vert_properties, np.float64)[:, :3], axis=0, return_inverse=True)
     faces = label.ravel()[np.asarray(made.tri_verts, np.int64)]
-    runs = np.diff(np.asarray(made.run_index, np.int64)) // 3
+    bounds = np.asarray(made.run_index, np.int64) // 3
+    runs = bounds[1:] - bounds[:-1]
     owner = np.repeat(np.asarray(made.run_original_id, np.int64) - first, runs)
     # Where edges of both parts meet, faces without area join corners at one place, or lie back to back.
     whole = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
