@@ -38,7 +38,8 @@ _SERVO: Final = {"approach_speed_mm_s": 8, "retract_mm": 8, "retract_speed_mm_s"
 _TASKS: Final[Mapping[str, Mapping[str, Any]]] = {
     "surface_following": {**_SERVO, "distance_mm": 8, "speed_mm_s": 4},
     "object_tracking": {**_SERVO, "depth_mm": 3, "duration_s": 4},
-    "single_arm_pushing": {**_SERVO, "push_speed_mm_s": 3},
+    # What the sensors touch here is a plane, and has no edges to steer by.
+    "single_arm_pushing": {**_SERVO, "steering": "bearing", "push_speed_mm_s": 3},
     "dual_arm_pushing": {
         **_SERVO,
         "steering": "bearing",

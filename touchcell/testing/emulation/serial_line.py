@@ -99,10 +99,13 @@ class PtyLine:
         return int(_TERMIOS2.unpack(settings)[-1])
 
     def hold(self) -> None:
-        """Hold the port as another program would."""
+        """Hold the port as another program would; one that finds it held goes away again."""
         if self._slave is not None and self._rival is None:
             self._rival = os.open(os.ttyname(self._slave), os.O_RDWR | os.O_NOCTTY)
-            fcntl.flock(self._rival, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            try:
+                fcntl.flock(self._rival, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                self.release()
 
     def release(self) -> None:
         """Release the port again."""
