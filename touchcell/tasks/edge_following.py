@@ -71,6 +71,9 @@ class EdgeFollowingConfig(ServoConfig):
     max_integral_turn_deg_s: PositiveFloat = 60.0
     max_accel_mm_s2: PositiveFloat = 550.0
     max_turn_accel_deg_s2: PositiveFloat = 1100.0
+    # An edge that is sharper or blunter than a right angle is told to 0.2 mm and 1.3 deg from frame to frame.
+    settle_tolerance_mm: PositiveFloat = 0.5
+    settle_tolerance_deg: PositiveFloat = 3.0
     bend_window_mm: PositiveFloat = 5.0
     speed_mm_s: Annotated[PositiveFloat, SPEED] = 30.0
     distance_mm: PositiveFloat = 100.0

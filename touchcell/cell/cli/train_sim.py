@@ -71,7 +71,7 @@ FITTED_VARIATION = Variation(
 )
 """About a real sensor, known better than the kind; ``field`` and ``slip`` are what its simulation cannot say."""
 
-EDGE_SETTINGS: Final[dict[str, Any]] = {
+DETAIL_SETTINGS: Final[dict[str, Any]] = {
     "batch_size": 128,
     "learning_rate": 1.5e-3,
     "noise": 0.01,
@@ -80,7 +80,7 @@ EDGE_SETTINGS: Final[dict[str, Any]] = {
     "zoom": 0.0003,
     "details": 120,
 }
-"""How far an edge is off is told by tenths of a pixel (docs/decisions/0051-edges-in-detail.md)."""
+"""How far an edge is off and how a surface leans is told by tenths of a pixel (docs/decisions/0051-edges-in-detail.md)."""
 
 PUBLIC_SIZE = (PUBLIC_CROP[3] - PUBLIC_CROP[1], PUBLIC_CROP[2] - PUBLIC_CROP[0])
 PUBLIC_MASK_PX = 216.0
@@ -191,9 +191,7 @@ def _train_markers(
     settings = MarkerSettings(seed=seed)
     if imagined.of_shapes:
         # One network in a file of 4 MB, which can ship. Its sensors scatter already, by what a camera is remounted.
-        settings = replace(settings, hidden=(384, 384, 256), networks=1)
-    if imagined.feature == "edge":
-        settings = replace(settings, **EDGE_SETTINGS)
+        settings = replace(settings, hidden=(384, 384, 256), networks=1, **DETAIL_SETTINGS)
     train_on_discs(
         _discs(imagined, samples, seed),
         _discs(imagined, samples // 5, seed + 1_000_000),
