@@ -80,7 +80,7 @@ DETAIL_SETTINGS: Final[dict[str, Any]] = {
     "zoom": 0.0003,
     "details": 120,
 }
-"""How far an edge is off and how a surface leans is told by tenths of a pixel (docs/decisions/0051-edges-in-detail.md)."""
+"""Edges and tilts are told by tenths of a pixel (docs/decisions/0051-edges-in-detail.md)."""
 
 PUBLIC_SIZE = (PUBLIC_CROP[3] - PUBLIC_CROP[1], PUBLIC_CROP[2] - PUBLIC_CROP[0])
 PUBLIC_MASK_PX = 216.0
