@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+import touchcell.cell.config.schema
+import touchcell.simulation.devices.rig  # noqa: F401  a run inside a test forgets what it was the first to import
 from touchcell.paths import CONFIGS
 
 pytest_plugins = ["pytester"]

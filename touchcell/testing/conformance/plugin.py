@@ -104,11 +104,12 @@ class _Table:
                 self._explain(f"RED {driver} {name}", str(report.longrepr).strip().splitlines()[-1])
             marks[driver] = "RED"
         elif report.skipped:
-            marks[driver] = "-"
+            # A driver may have several rigs: what one cannot show another may.
+            marks.setdefault(driver, "-")
             reason = report.longrepr[2] if isinstance(report.longrepr, tuple) else str(report.longrepr)
             self._explain(f"- {reason.removeprefix('Skipped: ')}", f"{driver}: {name}")
-        else:
-            marks.setdefault(driver, "green")
+        elif report.when == "call" and marks.get(driver, "-") == "-":
+            marks[driver] = "green"
 
     def _explain(self, title: str, line: str) -> None:
         self._reasons.setdefault(title, []).append(line[:_MAX_WIDTH])
