@@ -84,7 +84,7 @@ def test_a_labelled_split_is_a_sequence(tmp_path: Path, capsys: pytest.CaptureFi
 
 def test_behind_a_moving_plate_the_moving_surface_model_does_not_lag() -> None:
     rows = {
-        name: filter_tracking.track(name, moving=True, duration_s=6.0, seed=0) for name in ("still, drift 4", "moving")
+        name: filter_tracking.track(name, moving=True, duration_s=14.0, seed=0) for name in ("still, drift 4", "moving")
     }
     assert [row["outcome"] for row in rows.values()] == ["done", "done"]
     for component, factor in (("x_mm", 0.6), ("y_mm", 0.6), ("alpha_deg", 0.9), ("gamma_deg", 0.9)):
