@@ -1,4 +1,4 @@
-"""A tall prism that is pushed too high falls over in the dynamic world, unless the interlock stops the arm in time."""
+"""A tall prism that is pushed too high in the dynamic world: the interlock stops the arm, or else the task does."""
 
 from __future__ import annotations
 
@@ -74,7 +74,9 @@ def test_it_trips_before_the_prism_falls(tmp_path: Path) -> None:
     assert 5.0 < leant_deg < 9.0
 
 
-def test_without_it_the_prism_falls(tmp_path: Path) -> None:
+def test_without_it_the_task_gives_up_a_little_later(tmp_path: Path) -> None:
     pytest.importorskip("mujoco")
-    _, leant_deg = pushed(tmp_path, None)
-    assert leant_deg > 45.0
+    result, leant_deg = pushed(tmp_path, None)
+    assert result.outcome is Outcome.FAILED
+    assert "the object topples" in result.reason
+    assert 9.0 < leant_deg < 20.0
