@@ -91,16 +91,11 @@ def _options(arguments: Sequence[str]) -> argparse.Namespace:
 
 
 def _slips(options: argparse.Namespace) -> list[list[dict[str, Any]]]:
-    sequences = (
-        []
-        if options.data is None
-        else filter_slips.collected(options.data, options.split, options.model, options.frame_hz)
-    )
-    sets = (
-        [sequences]
-        if sequences
-        else [filter_slips.simulated(2 * options.orders, seed) for seed in range(options.seeds)]
-    )
+    sets = []
+    if options.data is not None:
+        sets = [filter_slips.collected(options.data, options.split, options.model, options.frame_hz)]
+    if not any(sets):
+        sets = [filter_slips.simulated(2 * options.orders, seed) for seed in range(options.seeds)]
     tables = []
     for sequences in sets:
         tables.append(filter_slips.compare(sequences))

@@ -15,11 +15,11 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import Any
 from unittest.mock import patch
 
 import numpy as np
 
+from tests.helpers.coal_distance import box_body, capsule_body
 from touchcell.cell.bench.provenance import provenance
 from touchcell.control.interlocks.collision import Box, Capsule, Clearances
 from touchcell.drivers.core.arm import LimitsConfig
@@ -184,30 +184,19 @@ def _distances() -> dict[str, tuple[float, float]]:
         assert len(found.pairs) == _PAIRS
         times[name] = _time(partial(found.distances, frames))
     with suppress(ImportError):
-        times["coal, without placing the bodies"] = _time(_coal_distances(found, capsules, boxes))
+        times["coal, without placing the bodies"] = _time(_coal_distances(found, capsules, boxes, frames))
     return times
 
 
-def _coal_distances(found: Clearances, capsules: Sequence[Capsule], boxes: Sequence[Box]) -> Callable[[], object]:
+def _coal_distances(
+    found: Clearances, capsules: Sequence[Capsule], boxes: Sequence[Box], frames: Array
+) -> Callable[[], object]:
     """Return a call that finds the distances of the same pairs with coal."""
     import coal
 
-    bodies: dict[str, tuple[Any, Any]] = {}
-    for capsule in capsules:
-        a, b = np.array(capsule.ends_m)
-        length = float(np.linalg.norm(b - a))
-        x, y = np.linalg.svd((b - a)[None])[2][1:]
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = np.column_stack([x, y, np.cross(x, y)]), 0.5 * (a + b)
-        bodies[capsule.name] = coal.Capsule(capsule.radius_m, length), T
-    bodies |= {box.name: (coal.Box(*(2.0 * box.half_m)), box.T_world_box) for box in boxes}
-    placed = {}
-    for name, (shape, T) in bodies.items():
-        place = coal.Transform3s()
-        place.setRotation(T[:3, :3])
-        place.setTranslation(T[:3, 3])
-        placed[name] = shape, place
-    pairs = [(*placed[pair.part], *placed[pair.other]) for pair in found.pairs]
+    bodies = {capsule.name: capsule_body(capsule, frames) for capsule in capsules}
+    bodies |= {box.name: box_body(box) for box in boxes}
+    pairs = [(*bodies[pair.part], *bodies[pair.other]) for pair in found.pairs]
     request, result = coal.DistanceRequest(), coal.DistanceResult()
 
     def distances() -> None:

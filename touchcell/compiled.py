@@ -26,6 +26,7 @@ EXTENSIONS: Final = {
 """Module name -> what its absence costs."""
 
 REQUIRE: Final = "TOUCHCELL_REQUIRE_COMPILED"
+PURE: Final = "TOUCHCELL_PURE_PYTHON"
 
 _logger = logging.getLogger(__name__)
 _warned: set[str] = set()
@@ -44,6 +45,17 @@ class ExtensionMissing(TouchcellError, ImportError):
             hint=f"install a C compiler and install touchcell again, or unset {REQUIRE}",
         )
         self.extension = extension
+
+
+def unless_plain(name: str) -> ModuleType | None:
+    """The extension ``name`` for code that has plain kernels, too: None where it was not built, or these are asked for.
+
+    The environment variable ``TOUCHCELL_PURE_PYTHON`` asks for them.
+
+    Raises:
+        ExtensionMissing: as ``extension`` does.
+    """
+    return None if os.environ.get(PURE) else extension(name)
 
 
 def extension(name: str) -> ModuleType | None:

@@ -15,7 +15,6 @@ Robotics (2nd ed. 2024), chapter 8, with the coefficients and the Jacobian block
 
 from __future__ import annotations
 
-import os
 from typing import Literal, Protocol, cast
 
 import numpy as np
@@ -55,7 +54,7 @@ class _Kernels(Protocol):
 
 
 def _choose() -> tuple[_Kernels, Literal["compiled", "python"]]:
-    found = None if os.environ.get("TOUCHCELL_PURE_PYTHON") else compiled.extension("touchcell.geometry._se3c")
+    found = compiled.unless_plain("touchcell.geometry._se3c")
     return (_plain, "python") if found is None else (cast(_Kernels, found), "compiled")
 
 

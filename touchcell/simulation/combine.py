@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from touchcell.geometry.types import Array
+from touchcell.simulation.meshes.indexing import coincident_as_one, has_three_corners
 from touchcell.simulation.meshes.smoothing import TriangleMesh
 from touchcell.simulation.surfaces import Surface
 
@@ -63,13 +64,14 @@ def combined(parts: Sequence[Part], operation: Operation) -> TriangleMesh:
     made: Any = Manifold.batch_boolean(solids, kind).to_mesh()
     if not len(made.tri_verts):
         return TriangleMesh(np.empty((0, 3)), np.empty((0, 3), np.int32))
-    vertices, label = np.unique(np.asarray(made.vert_properties, np.float64)[:, :3], axis=0, return_inverse=True)
-    faces = label.ravel()[np.asarray(made.tri_verts, np.int64)]
+    vertices, faces = coincident_as_one(
+        np.asarray(made.vert_properties, np.float64)[:, :3], np.asarray(made.tri_verts, np.int64)
+    )
     bounds = np.asarray(made.run_index, np.int64) // 3
     runs = bounds[1:] - bounds[:-1]
     owner = np.repeat(np.asarray(made.run_original_id, np.int64) - first, runs)
     # Where edges of both parts meet, faces without area join corners at one place, or lie back to back.
-    whole = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
+    whole = has_three_corners(faces)
     _, same, times = np.unique(np.sort(faces, axis=1), axis=0, return_inverse=True, return_counts=True)
     whole &= times[same.ravel()] == 1
     faces, owner = faces[whole], owner[whole]

@@ -15,7 +15,7 @@ import numpy as np
 
 from touchcell.geometry.types import Array
 
-_LEAN_RAD: Final = math.radians(6.0)
+LEAN_DEG: Final = 6.0
 """Turn of the normal out of the plane of the table: noise and load make less than 2 deg, and falls begin at 12."""
 _LEANS_S: Final = 0.1
 _FARTHER_M: Final = 0.02
@@ -60,7 +60,7 @@ class Standing:
                 "rolled or been moved"
             )
         lean = raised - self._upright
-        self._leans_s = self._leans_s + dt_s if abs(lean) > _LEAN_RAD else 0.0
+        self._leans_s = self._leans_s + dt_s if abs(lean) > math.radians(LEAN_DEG) else 0.0
         if self._leans_s > _LEANS_S:
             return f"what {self._sensor} touches leans by {np.degrees(abs(lean)):.0f} deg: the object topples"
         return ""

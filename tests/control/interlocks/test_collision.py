@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.helpers.coal_distance import box_body, capsule_body
 from touchcell.control.interlocks.collision import (
     TOOL,
     Box,
@@ -163,40 +164,21 @@ def test_coal_agrees(pure, monkeypatch):
     coal = pytest.importorskip("coal")
     arms, boxes, frames = scene(2)
     found = clearances(monkeypatch, arms, boxes, pure=pure)
-    shapes = {box.name: (coal.Box(*(2.0 * box.half_m)), box.T_world_box) for box in boxes}
     first = {"left": 0, "right": 2}
-    of_parts = [(arm, part) for arm, parts in arms.items() for part in parts]
-    placed = [coal_capsule(coal, frames[first[arm] :], part) for arm, part in of_parts]
-    pairs = [(i, j) for i in range(8) for j in range(i) if of_parts[i][0] != of_parts[j][0]]
-    judged = [coal_distance(coal, *placed[i], *placed[j]) for i, j in pairs]
-    judged += [coal_distance(coal, *placed[i], *shapes[box.name]) for i in range(8) for box in boxes]
+    parts = [(arm, capsule_body(part, frames[first[arm] :])) for arm, parts in arms.items() for part in parts]
+    pairs = [(parts[i][1], parts[j][1]) for i in range(8) for j in range(i) if parts[i][0] != parts[j][0]]
+    pairs += [(part, box_body(box)) for _, part in parts for box in boxes]
+    asked, answer = coal.DistanceRequest(), coal.DistanceResult()
+    judged = []
+    for one, other in pairs:
+        answer.clear()
+        judged.append(coal.distance(*one, *other, asked, answer))
     apart = found.distances(frames)
     # Where they overlap, coal tells how deep, and ours how deep at most a radius.
     outside = np.array(judged) > 0.0
     assert outside.sum() > 15
     np.testing.assert_allclose(apart[outside], np.array(judged)[outside], rtol=0.0, atol=1e-9)
     assert (apart[~outside] <= 0.0).all()
-
-
-def coal_capsule(coal, frames, part):
-    a, b = (T[:3, :3] @ end + T[:3, 3] for T, end in zip(frames[list(part.frames)], part.ends_m, strict=True))
-    length = float(np.linalg.norm(b - a))
-    _, _, turned = np.linalg.svd(((b - a) / length)[None])
-    x, y = turned[1:]
-    T = np.eye(4)
-    T[:3, :3] = np.column_stack([x, y, np.cross(x, y)])
-    T[:3, 3] = 0.5 * (a + b)
-    return coal.Capsule(part.radius_m, length), T
-
-
-def coal_distance(coal, shape, T, other, T_other):
-    places = []
-    for pose in (T, T_other):
-        place = coal.Transform3s()
-        place.setRotation(pose[:3, :3])
-        place.setTranslation(pose[:3, 3])
-        places.append(place)
-    return coal.distance(shape, places[0], other, places[1], coal.DistanceRequest(), coal.DistanceResult())
 
 
 def test_neighbouring_links_and_static_pairs_are_left_out():

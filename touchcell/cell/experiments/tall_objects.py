@@ -27,6 +27,7 @@ from touchcell.cell.experiments.runner import ExperimentSpec, Scale
 from touchcell.cell.experiments.table import Column
 from touchcell.cell.experiments.trials import Finished, Trial
 from touchcell.simulation.quasi_static import GRAVITY_M_S2
+from touchcell.tasks.push_standing import LEAN_DEG
 
 WITH, WITHOUT = "with follower", "alone"
 _ARMS = {WITH: replace(TWO_ARMS, cell="dual_push_tall_sim.yaml"), WITHOUT: ONE_ARM}
@@ -39,8 +40,6 @@ _FOLLOWER_MM = 3.0
 _SHEAR_N_MM = 0.4
 _SHEAR_MIN_MM, _SHEAR_MAX_MM = 0.5, 2.5
 _SAFETY = 1.1
-# Where a push is given up as toppling (``touchcell.tasks.push_standing``).
-_LOST_DEG = 6.0
 _ROUND = ("cylinder", "bottle")
 # The cell's follower yields laterally but slowly, for objects with flat sides: on these its contact would drift off the
 # line of the push, and the squeeze then turns a light slim one as much as friction on the table resists. The squeeze
@@ -113,7 +112,7 @@ def _cell_changes(pushed: Pushed, arms: str) -> dict[str, Any]:
 def measure(run: RunFolder) -> Mapping[str, float]:
     """Return ``pushing.push_measures`` plus ``lost``: leant so far that a push is given up, fallen or not."""
     found = push_measures(run)
-    return found | {"lost": float(found["lean_max_deg"] > _LOST_DEG)}
+    return found | {"lost": float(found["lean_max_deg"] > LEAN_DEG)}
 
 
 def draw(finished: Sequence[Finished], folder: Path) -> list[Path]:
@@ -169,7 +168,7 @@ SPEC = ExperimentSpec(
     measure=measure,
     columns=(
         Column("toppled", "toppled", "count"),
-        Column("lost", "lean > 6 deg", "count"),
+        Column("lost", f"lean > {LEAN_DEG:g} deg", "count"),
         Column("lean_max_deg", "lean deg", "worst", 1),
         Column("error_mm", "error mm", digits=2),
         Column("error_mm", "worst", "worst"),
@@ -183,6 +182,7 @@ SPEC = ExperimentSpec(
     },
     notes=(
         ERROR_NOTE,
-        "goals: none of nine leans by 6 deg with the follower, where a push is given up, at least seven without",
+        f"goals: none of nine leans by {LEAN_DEG:g} deg with the follower, where a push is given up, "
+        "at least seven without",
     ),
 )

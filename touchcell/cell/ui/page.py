@@ -334,7 +334,6 @@ class RunPage:
         _title("Cell")
         self._groups: dict[str, Any] = {}
         self._marks: dict[str, Any] = {}
-        self._solid: set[str] = set()
         scene = self._view.scene
         if scene is None:
             ui.label("this cell cannot be drawn")
@@ -344,9 +343,6 @@ class RunPage:
             for number, part in enumerate(scene.parts):
                 if part.frame not in self._groups:
                     self._groups[part.frame] = element.group()
-                # Of boxes and paths, and of bases where nothing is drawn, the view need not be full.
-                if part.frame != "world" and not isinstance(part.solid, Polyline):
-                    self._solid.add(part.frame)
                 with self._groups[part.frame]:
                     _draw(element, part, f"/part/{self._name}/{number}.stl")
             for sensor in self._view.plan.sensor_roles:
@@ -355,7 +351,8 @@ class RunPage:
 
     def _move(self, moment: Moment) -> None:
         """Put every frame of the scene where it is now."""
-        if self._scene is None:
+        scene = self._view.scene
+        if self._scene is None or scene is None:
             return
         first = not self._drawn
         for frame, group in self._groups.items():
@@ -375,7 +372,9 @@ class RunPage:
                 T_f_s = se3.from_euler_mm_deg(np.array([value for _, value, _ in row.values]))
                 mark.move(*(T_world_sensor @ se3.inverse(T_f_s))[:3, 3].tolist())
         if first and self._drawn:
-            points = np.array([T[:3, 3] for frame, T in self._drawn.items() if frame in self._solid] or [np.zeros(3)])
+            # Of boxes and paths, and of bases where nothing is drawn, the view need not be full.
+            solid = {part.frame for part in scene.parts if not isinstance(part.solid, Polyline)} - {"world"}
+            points = np.array([T[:3, 3] for frame, T in self._drawn.items() if frame in solid] or [np.zeros(3)])
             low, high = points.min(axis=0), points.max(axis=0)
             x, y, z = (0.5 * (low + high)).tolist()
             # Twice the distance at which what moves would fill the view: links reach beyond their frames.

@@ -93,26 +93,30 @@ static double from_box(const double *a0, const double *a1, const double *T, cons
     return sqrt(dot(off, off));
 }
 
-static int doubles(PyObject *value, void *to)
+/* The array, if it is contiguous and of the type; NULL with an exception if not. */
+static PyArrayObject *readable(PyObject *value, int type)
 {
     PyArrayObject *array = (PyArrayObject *)value;
-    if (!PyArray_CheckExact(value) || PyArray_TYPE(array) != NPY_DOUBLE || !PyArray_ISCARRAY_RO(array)) {
-        PyErr_SetString(PyExc_TypeError, "not a contiguous float64 array");
-        return 0;
-    }
-    *(Doubles *)to = (Doubles){PyArray_DATA(array), PyArray_SIZE(array)};
-    return 1;
+    if (PyArray_CheckExact(value) && PyArray_TYPE(array) == type && PyArray_ISCARRAY_RO(array))
+        return array;
+    PyErr_Format(PyExc_TypeError, "not a contiguous array of %s", type == NPY_DOUBLE ? "float64" : "indices");
+    return NULL;
+}
+
+static int doubles(PyObject *value, void *to)
+{
+    PyArrayObject *array = readable(value, NPY_DOUBLE);
+    if (array)
+        *(Doubles *)to = (Doubles){PyArray_DATA(array), PyArray_SIZE(array)};
+    return array != NULL;
 }
 
 static int indices(PyObject *value, void *to)
 {
-    PyArrayObject *array = (PyArrayObject *)value;
-    if (!PyArray_CheckExact(value) || PyArray_TYPE(array) != NPY_INTP || !PyArray_ISCARRAY_RO(array)) {
-        PyErr_SetString(PyExc_TypeError, "not a contiguous array of indices");
-        return 0;
-    }
-    *(Indices *)to = (Indices){PyArray_DATA(array), PyArray_SIZE(array)};
-    return 1;
+    PyArrayObject *array = readable(value, NPY_INTP);
+    if (array)
+        *(Indices *)to = (Indices){PyArray_DATA(array), PyArray_SIZE(array)};
+    return array != NULL;
 }
 
 static int below(Indices list, npy_intp limit)

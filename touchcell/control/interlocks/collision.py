@@ -6,7 +6,6 @@ one from the shoulder to the tool stands for all links between, for an arm that 
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -117,8 +116,7 @@ class Clearances:
             poses[obstacles[1]],
             half[obstacles[1]],
         )
-        pure = os.environ.get("TOUCHCELL_PURE_PYTHON")
-        self._compiled = None if pure else compiled.extension("touchcell.control.interlocks._distances")
+        self._compiled = compiled.unless_plain("touchcell.control.interlocks._distances")
 
     def distances(self, T_world_frames: Array) -> Array:
         """Return (p,) distances in m of all pairs; negative where they overlap, by at most a capsule's radius.

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from touchcell.errors import ConfigError
+from touchcell.simulation.meshes.indexing import connected, has_three_corners
 from touchcell.simulation.meshes.pieces import apart, as_one, has_piece_inside_out, pieces_of
 from touchcell.simulation.meshes.smoothing import Edges, TriangleMesh
 
@@ -180,8 +181,7 @@ def _triangles(loaded: Any, unit: Unit) -> TriangleMesh:
 
 def _without_empty_faces(mesh: TriangleMesh) -> TriangleMesh:
     """Drop faces without area, and those that are there twice the same way round."""
-    a, b, c = mesh.faces.T
-    kept = mesh.faces[(a != b) & (b != c) & (c != a)]
+    kept = mesh.faces[has_three_corners(mesh.faces)]
     turned = np.take_along_axis(kept, (kept.argmin(axis=1)[:, None] + np.arange(3)) % 3, axis=1)
     _, first = np.unique(turned, axis=0, return_index=True)
     return TriangleMesh(mesh.vertices, np.ascontiguousarray(kept[np.sort(first)]))
@@ -278,15 +278,7 @@ def _nearly_closed(mesh: TriangleMesh, piece: NDArray[np.int64], open_edge: NDAr
     face, edge = np.nonzero(open_edge)
     start, end = mesh.faces[face, edge], mesh.faces[face, (edge + 1) % 3]
     # The edges of each opening end in each other: their lowest corner numbers the opening.
-    opening = np.arange(len(mesh.vertices))
-    while True:
-        least = opening.copy()
-        np.minimum.at(least, start, opening[end])
-        np.minimum.at(least, end, opening[start])
-        least = least[least]
-        if np.array_equal(least, opening):
-            break
-        opening = least
+    opening = connected(len(mesh.vertices), start, end)
     lids, owner = np.zeros_like(mesh.vertices), np.zeros(len(mesh.vertices), np.int64)
     middle = mesh.vertices.mean(axis=0)
     np.add.at(lids, opening[start], np.cross(mesh.vertices[start] - middle, mesh.vertices[end] - middle))

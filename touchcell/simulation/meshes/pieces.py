@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from touchcell.geometry.types import Array
+from touchcell.simulation.meshes.indexing import coincident_as_one, connected, has_three_corners
 from touchcell.simulation.meshes.smoothing import Edges, TriangleMesh
 
 _SHARED_M3: Final = 1e-9
@@ -16,16 +17,8 @@ _APART_M: Final = 1e-6
 
 def pieces_of(edges: Edges) -> NDArray[np.int64]:
     """Return (m,) a number for each face, the same for faces that edges connect."""
-    face, edge = np.nonzero(edges.other >= 0)
-    other = edges.other[face, edge]
-    label = np.arange(len(edges.other))
-    while True:
-        least = label.copy()
-        np.minimum.at(least, face, label[other])
-        least = least[least]
-        if np.array_equal(least, label):
-            return label
-        label = least
+    face, edge = np.nonzero(edges.other > np.arange(len(edges.other))[:, None])
+    return connected(len(edges.other), face, edges.other[face, edge])
 
 
 def volume_m3(mesh: TriangleMesh) -> float:
@@ -58,10 +51,9 @@ def as_one(mesh: TriangleMesh, *, touching: bool = False) -> TriangleMesh:
     cavities = mesh.faces[~solid[piece]]
     vertices = np.concatenate([np.asarray(made.vert_properties, np.float64)[:, :3], mesh.vertices])
     faces = np.concatenate([np.asarray(made.tri_verts, np.int64), cavities + len(made.vert_properties)])
-    vertices, label = np.unique(vertices, axis=0, return_inverse=True)
-    faces = label.ravel()[faces]
+    vertices, faces = coincident_as_one(vertices, faces)
     # Where edges of both meet, faces without area join corners at one place.
-    faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
+    faces = faces[has_three_corners(faces)]
     # Those that touch along an edge share it now.
     return apart(TriangleMesh(vertices, np.ascontiguousarray(faces, dtype=np.int32)))
 
@@ -94,16 +86,7 @@ def apart(mesh: TriangleMesh) -> TriangleMesh:
     here, there = here[meets], there[meets]
     # The start of one face's edge is the end of the other's.
     after = 3 * (np.arange(faces.size) // 3) + (np.arange(faces.size) % 3 + 1) % 3
-    label = np.arange(faces.size)
-    one, other = np.concatenate([here, after[here]]), np.concatenate([after[there], there])
-    while True:
-        least = label.copy()
-        np.minimum.at(least, one, label[other])
-        np.minimum.at(least, other, label[one])
-        least = least[least]
-        if np.array_equal(least, label):
-            break
-        label = least
+    label = connected(faces.size, np.concatenate([here, after[here]]), np.concatenate([after[there], there]))
     kept, corners = np.unique(label, return_inverse=True)
     return TriangleMesh(mesh.vertices[start[kept]], np.ascontiguousarray(corners.reshape(-1, 3), dtype=np.int32))
 

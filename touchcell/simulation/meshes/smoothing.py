@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from touchcell.geometry.types import Array
+from touchcell.simulation.meshes.indexing import connected
 
 Indices = NDArray[np.int32]
 
@@ -166,19 +167,12 @@ def _as_told(normals: Array, told: Array, group: NDArray[np.int64]) -> Array:
 
 def _groups(faces: Indices, neighbours: Indices, other_edge: Indices) -> NDArray[np.int64]:
     """Return (3 m) the group of each corner: corners at one vertex that smooth edges connect."""
-    face, edge = np.nonzero(neighbours >= 0)
+    face, edge = np.nonzero(neighbours >= np.arange(len(faces))[:, None])
     other, back = neighbours[face, edge], other_edge[face, edge]
     # Across an edge the start of one face's is the end of the other's.
     here = np.concatenate([3 * face + edge, 3 * face + (edge + 1) % 3])
     there = np.concatenate([3 * other + (back + 1) % 3, 3 * other + back])
-    label = np.arange(faces.size)
-    while True:
-        least = label.copy()
-        np.minimum.at(least, here, label[there])
-        least = least[least]
-        if np.array_equal(least, label):
-            return label
-        label = least
+    return connected(faces.size, here, there)
 
 
 def _corner_normals(vertices: Array, faces: Indices, normal: Array, area: Array, group: NDArray[np.int64]) -> Array:
