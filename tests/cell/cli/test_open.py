@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import shutil
+import sys
 from pathlib import Path
 
 import pytest
@@ -79,6 +80,7 @@ def test_reruns_viewer_need_not_be_in_path_and_its_failure_is_one_message(
         raise RuntimeError("no display\nand much more")
 
     monkeypatch.setenv("PATH", "")
+    monkeypatch.setenv("DISPLAY", ":0")
     monkeypatch.setattr(rerun, "spawn", spawn)
     assert main(["open", str(folder), "--rerun"]) == 2
     assert Path(asked[0]).is_file()
@@ -86,6 +88,19 @@ def test_reruns_viewer_need_not_be_in_path_and_its_failure_is_one_message(
     assert "does not start: no display" in printed
     assert "much more" not in printed
     assert "--foxglove" in printed
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only there a machine without a display says so")
+def test_without_a_display_it_says_so_and_how_to_see_it_in_a_browser(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("rerun", reason="pip install 'touchcell[rerun]'")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    assert main(["open", str(folder), "--rerun"]) == 2
+    printed = capsys.readouterr().err
+    assert "no display" in printed
+    assert "--to FILE.rrd" in printed
 
 
 def test_a_target_without_rerun_is_refused(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 import rerun as rr
@@ -18,6 +19,9 @@ from touchcell.cell.scene.description import SceneDescription, describe_scene
 from touchcell.cell.scene.frames import WORLD
 from touchcell.geometry.solids import Polyline, triangulated
 
+_VIEWER_ANSWERS_S: Final = 60.0
+"""A viewer that could not start takes nothing, and its client waits for it."""
+
 
 def show_in_rerun(folder: Path, target: Path | None = None) -> None:
     """Open a run in Rerun's viewer, or write it as a file for it.
@@ -28,7 +32,7 @@ def show_in_rerun(folder: Path, target: Path | None = None) -> None:
 
     Raises:
         ConfigError: the cell file of the run cannot be read.
-        RuntimeError: the viewer does not start.
+        RuntimeError: the viewer does not start, or has gone.
     """
     run = RunFolder(folder)
     scene = describe_scene(run.plan)
@@ -46,10 +50,10 @@ def show_in_rerun(folder: Path, target: Path | None = None) -> None:
         recording.save(target, default_blueprint=blueprint)
     with whole(folder / RECORDING) as readable:
         recording.log_file_from_path(readable)
-        recording.flush()
+        recording.flush(timeout_sec=_VIEWER_ANSWERS_S)
     _log_scene(recording, scene)
     _log_numbers(recording, run)
-    recording.flush()
+    recording.flush(timeout_sec=_VIEWER_ANSWERS_S)
 
 
 def _blueprint(images: list[str], plots: list[str]) -> rrb.Blueprint:

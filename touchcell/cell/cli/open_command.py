@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 from typing import Final
 
@@ -56,12 +58,20 @@ def open_in_rerun(folder: Path, target: Path | None) -> None:
             key="--rerun",
             hint="pip install 'touchcell[rerun]', or --foxglove",
         ) from None
+    if target is None and not _has_display():
+        raise _no_viewer("this machine has no display")
     try:
         show_in_rerun(folder, target)
     except RuntimeError as error:
-        reason = str(error).partition("\n")[0]
-        raise ConfigError(
-            f"Rerun's viewer does not start: {reason}", key="--rerun", hint="--to FILE.rrd, or --foxglove"
-        ) from None
+        raise _no_viewer(str(error).partition("\n")[0]) from None
     if target is not None:
         say(f"written: {target} (`rerun {target}` shows it)")
+
+
+def _has_display() -> bool:
+    return sys.platform != "linux" or any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
+
+
+def _no_viewer(reason: str) -> ConfigError:
+    hint = "--to FILE.rrd, which `rerun FILE.rrd --web-viewer` shows in a browser, or --foxglove"
+    return ConfigError(f"Rerun's viewer does not start: {reason}", key="--rerun", hint=hint)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from touchcell.cell.config.demands import demands
 from touchcell.cell.config.rule_limits import is_kind, limits_of
-from touchcell.cell.config.starts import pose_of, start_near, start_of_arm
+from touchcell.cell.config.starts import given_start, pose_of, start_near, start_of_arm
 from touchcell.cell.config.yaml_file import YamlFile
 from touchcell.drivers.core.arm import LimitsConfig
 from touchcell.drivers.core.scene import scene_section
@@ -192,7 +192,7 @@ def _starts(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
     boxes: dict[str, Any] = {rule: box for rule, box in plan.cell.interlocks.items() if is_kind(box, "workspace")}
     for rule, box in boxes.items():
         name = plan.arm_roles.get(box.arm, box.arm)
-        start = getattr(plan.arms[name].config, "start_pose_mm_deg", None) if name in plan.arms else None
+        start = given_start(plan, name) if name in plan.arms else None
         if start is None:
             continue
         try:
@@ -222,7 +222,8 @@ def _starts(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
 
 def _contacts(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
     """Tips pressed into the scene at the start of a task whose first frame has no contact; and no edge."""
-    if plan.cell.scene is None or not plan.task.starts_free or plan.cell.truth is not None:
+    around = plan.cell.emulated_scene if plan.cell.world == "emulated" else plan.cell.scene
+    if around is None or not plan.task.starts_free or plan.cell.truth is not None:
         return
     tips, arms = {}, {}
     for name in plan.sensor_roles.values():
@@ -231,7 +232,7 @@ def _contacts(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
             base = pose_of(plan.cell.arms[sensor.mounted_on].base_pose_mm_deg)
             if base is not None:
                 arms[name], tips[name] = sensor.mounted_on, base @ start @ sensor.T_tcp_sensor
-    scene = scene_section().model_validate(plan.cell.scene)
+    scene = scene_section().model_validate(around)
     try:
         pressed = scene.pressed(tips)
     except (ConfigError, GeometryError) as error:

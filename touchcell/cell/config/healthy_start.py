@@ -7,16 +7,13 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
-import numpy as np
-
 from touchcell.cell.config.armed import NotArmed, arm_roles
+from touchcell.cell.config.starts import start_of_arm
 from touchcell.control.interlocks.config import build_interlocks
 from touchcell.control.interlocks.coverage import CellFacts, with_arm, with_motion
 from touchcell.control.interlocks.snapshot import CellView
 from touchcell.control.latch import unlogged_latch
 from touchcell.control.supervisor import Supervisor
-from touchcell.geometry import se3
-from touchcell.geometry.errors import GeometryError
 from touchcell.geometry.types import Array
 
 if TYPE_CHECKING:
@@ -95,12 +92,8 @@ def _starts(plan: CellPlan) -> dict[str, Array]:
     """Return the pose (4, 4) of every arm whose start is known, by role."""
     found = {}
     for name, role in arm_roles(plan).items():
-        pose = getattr(plan.arms[name].config, "start_pose_mm_deg", None)
-        if pose is not None:
-            try:
-                found[role] = se3.from_euler_mm_deg(np.array(pose))
-            except GeometryError:
-                continue
+        if (T_base_tcp := start_of_arm(plan, name)) is not None:
+            found[role] = T_base_tcp
     return found
 
 

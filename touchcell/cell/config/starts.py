@@ -17,8 +17,19 @@ if TYPE_CHECKING:
 
 def start_of_arm(plan: CellPlan, arm: str) -> Array | None:
     """Return the pose (4, 4) of an arm's tool in its base frame at the start, if the cell knows it."""
-    pose = getattr(plan.arms[arm].config, "start_pose_mm_deg", None)
+    pose = given_start(plan, arm)
     return None if pose is None else pose_of(pose)
+
+
+def given_start(plan: CellPlan, arm: str) -> Any:
+    """Return an arm's start pose as the file or its driver gives it, [x y z] mm and [alpha beta gamma] deg, or None.
+
+    A real arm starts where it is; its stand-in and its emulator start where its section of the file says.
+    """
+    pose = getattr(plan.arms[arm].config, "start_pose_mm_deg", None)
+    if pose is None and plan.cell.world in ("sim", "emulated"):
+        return plan.cell.arms[arm].start_pose_mm_deg
+    return pose
 
 
 def start_of_sensor(plan: CellPlan) -> tuple[Array | None, Array]:
