@@ -18,7 +18,10 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from threading import Thread
 from typing import Any, Final
 
 import yaml
@@ -29,9 +32,10 @@ from touchcell.paths import CHECKOUT
 _DEADLINE_S: Final = 180.0
 _PHONE: Final = {"width": 390, "height": 844}
 _DESK: Final = {"width": 1280, "height": 900}
+_WINDOW: Final = {"width": 1100, "height": 720}
 _TALL: Final = {"width": 1280, "height": 1500}
 _SLIDES_IN_S: Final = 3.0
-_RERUN_SETTLES_S: Final = 60.0
+_RERUN_SETTLES_S: Final = 100.0
 """Software draws Rerun's viewer here, and decodes the images meanwhile."""
 
 
@@ -101,18 +105,20 @@ def _rerun(browser: Any, folder: Path, picture: Path) -> None:
     import rerun_cli
 
     _touchcell(folder, "open", "dual_push", "--rerun", "--to", "run.rrd")
-    page_port, data_port = _free_port(), _free_port()
-    command = [str(Path(rerun_cli.__file__).with_name("rerun")), "run.rrd", "--web-viewer"]
-    command += ["--web-viewer-port", str(page_port), "--port", str(data_port)]
-    with subprocess.Popen(command, cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as viewer:
-        try:
-            _until(lambda: _listens(page_port) and _listens(data_port))
-            url = f"http://127.0.0.1:{page_port}?url=rerun%2Bhttp://127.0.0.1:{data_port}/proxy"
-            page = _page(browser, url, _DESK)
-            page.locator("canvas").first.wait_for()
-            _take(page, picture, settles_s=_RERUN_SETTLES_S)
-        finally:
-            viewer.terminate()
+    port = _free_port()
+    # As a plain file: the viewer's own proxy takes a core of its own for minutes.
+    with _files_served(folder) as files:
+        command = [str(Path(rerun_cli.__file__).with_name("rerun")), f"{files}/run.rrd", "--serve-web"]
+        command += ["--web-viewer-port", str(port), "--port", str(_free_port())]
+        quiet: Any = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+        with subprocess.Popen(command, env=os.environ | {"BROWSER": "true"}, **quiet) as viewer:
+            try:
+                _until(lambda: _listens(port))
+                page = _page(browser, f"http://127.0.0.1:{port}/?url={files}/run.rrd&renderer=webgl", _WINDOW)
+                page.locator("canvas").first.wait_for()
+                _take(page, picture, settles_s=_RERUN_SETTLES_S)
+            finally:
+                viewer.terminate()
 
 
 _PICTURES: Final[dict[str, Callable[[Any, Path, Path], None]]] = {
@@ -168,6 +174,24 @@ def _served(folder: Path, *arguments: str) -> Iterator[str]:
         # What it would still write and draw is thrown away.
         process.kill()
         process.wait()
+
+
+@contextmanager
+def _files_served(folder: Path) -> Iterator[str]:
+    """Serve the files of a folder to pages of any origin; yields its address."""
+
+    class Handler(SimpleHTTPRequestHandler):
+        def end_headers(self) -> None:
+            self.send_header("Access-Control-Allow-Origin", "*")
+            super().end_headers()
+
+        def log_message(self, format: str, *args: object) -> None:
+            """Say nothing."""
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), partial(Handler, directory=str(folder))) as server:
+        Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_port}"
+        server.shutdown()
 
 
 def _page(browser: Any, address: str, size: dict[str, int]) -> Any:

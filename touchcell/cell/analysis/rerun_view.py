@@ -48,12 +48,12 @@ def show_in_rerun(folder: Path, target: Path | None = None) -> None:
         )
     else:
         recording.save(target, default_blueprint=blueprint)
+    # First what is small: a viewer that reads as it comes draws the scene while it waits for images.
+    _log_scene(recording, scene)
+    _log_numbers(recording, run)
     with whole(folder / RECORDING) as readable:
         recording.log_file_from_path(readable)
         recording.flush(timeout_sec=_VIEWER_ANSWERS_S)
-    _log_scene(recording, scene)
-    _log_numbers(recording, run)
-    recording.flush(timeout_sec=_VIEWER_ANSWERS_S)
 
 
 def _blueprint(images: list[str], plots: list[str]) -> rrb.Blueprint:
