@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -20,6 +21,7 @@ from touchcell.perception.runtime.contact_gate import CHANGE_PERCENT_PER_MM
 from touchcell.tasks.planned_motions import (
     Impossible,
     PlannedHold,
+    PlannedMotion,
     PlannedRide,
     PlannedSlide,
     PlannedStart,
@@ -29,6 +31,7 @@ from touchcell.tasks.planned_motions import (
 
 if TYPE_CHECKING:
     from touchcell.cell.config.cell_plan import CellPlan
+    from touchcell.drivers.core.scene import SceneSection
 
 # Numbers that are equal but for rounding are no contradiction.
 _SLACK: Final = 1.0 + 1e-9
@@ -127,33 +130,76 @@ def ways_over(plan: CellPlan) -> Ways:
 
 
 def _ways(plan: CellPlan) -> Iterator[tuple[KeyPath, Array]]:
-    start, mount = start_of_sensor(plan)
-    reach_mm = getattr(plan.task_config, "approach_distance_mm", None)
-    if plan.cell.scene is None or plan.task.motions is None or start is None or reach_mm is None:
+    first = _first_approach(plan)
+    if first is None:
         return
-    arm = plan.cell.sensors[plan.sensor_roles[min(plan.sensor_roles)]].mounted_on
-    base = None if arm is None else pose_of(plan.cell.arms[arm].base_pose_mm_deg)
-    if base is None:
-        return
-    scene, tip, reach_m = scene_section().model_validate(plan.cell.scene), base @ start @ mount, 1e-3 * reach_mm
+    scene, tip, reach_m = first.scene, first.T_world_sensor, first.reach_m
     retract_m = 1e-3 * float(getattr(plan.task_config, "retract_mm", 0.0))
-    for motion in plan.task.motions(plan.task_config, start, mount):
+    for motion in _motions(plan):
         if isinstance(motion, PlannedSlide) and motion.known and motion.corners_m:
             way = scene.points_over(tip, np.array(motion.corners_m), motion.depth_m, reach_m)
             if way is not None:
-                yield motion.key, (way - base[:3, 3]) @ base[:3, :3]
+                yield motion.key, first.in_base(way)
         elif isinstance(motion, PlannedSlide) and motion.known:
             way = scene.way_over(tip, motion.direction_rad, motion.distance_m, motion.depth_m, reach_m, retract_m)
             if way is not None:
-                inner = (way - base[:3, 3]) @ base[:3, :3]
+                inner = first.in_base(way)
                 yield motion.key, inner[:-1]
                 yield ("retract_mm",), inner[-1:]
         elif isinstance(motion, PlannedRide):
             way = scene.ride(tip, reach_m, motion.lasts_s)
             if way is not None:
                 # The contact is made a little later, when the surface has moved on.
-                inner = (way - base[:3, 3]) @ base[:3, :3]
+                inner = first.in_base(way)
                 yield motion.key, inner + (inner[0] - inner) * min(1.0, _RIDE_SLACK_M / _extent(inner))
+
+
+@dataclass(frozen=True, slots=True)
+class _Approach:
+    """How a sensor comes upon the scene.
+
+    Attributes:
+        arm: name of the arm that carries it.
+        sensor: its name.
+        scene: what it comes upon.
+        T_world_base: (4, 4) where its arm stands.
+        T_world_sensor: (4, 4) its own start.
+        reach_m: how far it searches along its axis.
+    """
+
+    arm: str
+    sensor: str
+    scene: SceneSection
+    T_world_base: Array
+    T_world_sensor: Array
+    reach_m: float
+
+    def in_base(self, way_m: Array) -> Array:
+        """Return points (n, 3) of the world in the base frame of the arm."""
+        inner: Array = (way_m - self.T_world_base[:3, 3]) @ self.T_world_base[:3, :3]
+        return inner
+
+
+def _first_approach(plan: CellPlan) -> _Approach | None:
+    """Return how the task's first sensor comes upon the scene; None where that is not known from the start."""
+    reach_mm = getattr(plan.task_config, "approach_distance_mm", None)
+    if plan.cell.scene is None or not plan.sensor_roles or reach_mm is None:
+        return None
+    sensor = _first_sensor(plan)
+    arm, tip = plan.cell.sensors[sensor].mounted_on, _tip(plan, sensor)
+    if arm is None or tip is None:
+        return None
+    scene = scene_section().model_validate(plan.cell.scene)
+    return _Approach(arm, sensor, scene, plan.cell.arms[arm].T_world_base, tip, 1e-3 * reach_mm)
+
+
+def _first_sensor(plan: CellPlan) -> str:
+    return plan.sensor_roles[min(plan.sensor_roles)]
+
+
+def _motions(plan: CellPlan) -> Iterable[PlannedMotion]:
+    """Return what the task tells of its motions."""
+    return () if plan.task.motions is None else plan.task.motions(plan.task_config, *start_of_sensor(plan))
 
 
 def _lifted_out(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
@@ -180,20 +226,14 @@ def _lifted_out(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
 
 def _left_behind(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
     """Motions of what a contact goes along with that its arm cannot keep up with."""
-    start, mount = start_of_sensor(plan)
-    reach_mm = getattr(plan.task_config, "approach_distance_mm", None)
-    if plan.cell.scene is None or plan.task.motions is None or not plan.sensor_roles or reach_mm is None:
+    first = _first_approach(plan)
+    limits = None if first is None else getattr(plan.arms[first.arm].config, "limits", None)
+    if first is None or not isinstance(limits, LimitsConfig):
         return
-    name = plan.sensor_roles[min(plan.sensor_roles)]
-    tip, arm = _tip(plan, name), plan.cell.sensors[name].mounted_on
-    limits = None if arm is None else getattr(plan.arms[arm].config, "limits", None)
-    if tip is None or not isinstance(limits, LimitsConfig):
-        return
-    scene = scene_section().model_validate(plan.cell.scene)
-    for motion in plan.task.motions(plan.task_config, start, mount):
+    for motion in _motions(plan):
         if not isinstance(motion, PlannedRide):
             continue
-        way_m = scene.ride(tip, 1e-3 * reach_mm, motion.lasts_s)
+        way_m = first.scene.ride(first.T_world_sensor, first.reach_m, motion.lasts_s)
         if way_m is None:
             continue
         step_m = limits.tcp_speed_m_s * motion.lasts_s / max(len(way_m) - 1, 1)
@@ -204,8 +244,8 @@ def _left_behind(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
             farthest_m = max(farthest_m, behind_m - step_m)
         if farthest_m > _RIDE_SLACK_M:
             yield file.problem(
-                ("arms", str(arm), "limits", "tcp_speed_m_s"),
-                f"{1e3 * limits.tcp_speed_m_s:g} mm/s is less than what {name!r} is carried along with: "
+                ("arms", first.arm, "limits", "tcp_speed_m_s"),
+                f"{1e3 * limits.tcp_speed_m_s:g} mm/s is less than what {first.sensor!r} is carried along with: "
                 f"it falls {1e3 * farthest_m:.0f} mm behind",
                 value=limits.tcp_speed_m_s,
                 hint="raise it, with interlocks.tcp_speed and the margins, or let the object move more slowly",
@@ -218,17 +258,15 @@ def _extent(way_m: Array) -> float:
 
 
 def _impossible(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
-    for motion in () if plan.task.motions is None else plan.task.motions(plan.task_config, *start_of_sensor(plan)):
+    for motion in _motions(plan):
         if isinstance(motion, Impossible):
             yield file.problem(("task", *motion.key), motion.why, hint=motion.hint)
 
 
 def _times(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
     """Times that are shorter than what they are for."""
-    if plan.task.motions is None:
-        return
     reported: set[KeyPath] = set()
-    for motion in plan.task.motions(plan.task_config, *start_of_sensor(plan)):
+    for motion in _motions(plan):
         if (
             isinstance(motion, PlannedTime)
             and not (motion.by_model and not _has_model(plan))
@@ -325,14 +363,14 @@ def _gains(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
 def _pressing(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
     """Speeds towards a first touch from which no arm of the task stops before the depth limit."""
     limits = limits_of(plan, "depth", "limit_mm")
-    if plan.task.motions is None or not limits:
+    if not limits:
         return
     rule, limit_mm = min(limits.items(), key=lambda each: each[1])
     arms = (getattr(device.config, "limits", None) for device in plan.arms.values())
     accel_m_s2 = max((each.tcp_accel_m_s2 for each in arms if isinstance(each, LimitsConfig)), default=math.inf)
     latencies_ms = [float(getattr(device.config, "latency_ms", 0.0)) for device in plan.sensors.values()]
     reported: set[KeyPath] = set()
-    for motion in plan.task.motions(plan.task_config, *start_of_sensor(plan)):
+    for motion in _motions(plan):
         if not isinstance(motion, PlannedStart) or not motion.presses or motion.key in reported:
             continue
         braking_m = motion.speed_m_s * (1e-3 * min(latencies_ms, default=0.0) + 0.5 * motion.speed_m_s / accel_m_s2)
@@ -363,11 +401,11 @@ def _unmet(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
                     value=reach_mm,
                     hint="start nearer to the surface and turned towards it, or search farther",
                 )
-    if plan.task.motions is None or not plan.sensor_roles:
+    if not plan.sensor_roles:
         return
-    name = plan.sensor_roles[min(plan.sensor_roles)]
+    name = _first_sensor(plan)
     reported: set[KeyPath] = set()
-    for motion in plan.task.motions(plan.task_config, *start_of_sensor(plan)):
+    for motion in _motions(plan):
         if not isinstance(motion, PlannedTouch) or motion.key in reported:
             continue
         tip = _tip(plan, name, motion.T_base_tcp)
@@ -395,20 +433,17 @@ def _tip(plan: CellPlan, sensor: str, T_base_tcp: Array | None = None) -> Array 
 
 def _untouched(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
     """Steps that hold a contact before anything is touched."""
-    if plan.task.motions is None or not plan.sensor_roles:
+    if not plan.sensor_roles:
         return
-    name = plan.sensor_roles[min(plan.sensor_roles)]
-    arm = plan.cell.sensors[name].mounted_on
-    base = None if arm is None else pose_of(plan.cell.arms[arm].base_pose_mm_deg)
-    _, mount = start_of_sensor(plan)
+    name = _first_sensor(plan)
     reported: set[KeyPath] = set()
-    for motion in plan.task.motions(plan.task_config, *start_of_sensor(plan)):
+    for motion in _motions(plan):
         if not isinstance(motion, PlannedHold) or motion.key in reported:
             continue
         after = motion.after
-        if not after and plan.cell.scene is not None and motion.T_base_tcp is not None and base is not None:
+        tip = None if motion.T_base_tcp is None else _tip(plan, name, motion.T_base_tcp)
+        if not after and plan.cell.scene is not None and tip is not None:
             scene = scene_section().model_validate(plan.cell.scene)
-            tip = base @ motion.T_base_tcp @ mount
             after = "" if scene.touches(tip) else f"standing clear of the scene with {name!r}"
         if after:
             reported.add(motion.key)
