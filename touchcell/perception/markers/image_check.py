@@ -162,10 +162,7 @@ class ImageCheck:
         left = off.ravel() - self._mean
         weight = np.repeat(seen, 2).astype(np.float64)
         for _ in range(_ROBUST):
-            weighted = rows * weight
-            moments = weighted @ rows.T
-            moments.flat[:: len(ridge) + 1] += ridge
-            found = np.linalg.solve(moments, weighted @ left)
+            found = _fitted(rows, left, weight, ridge)
             weight = np.repeat(seen, 2) / (1.0 + np.square((left - found @ rows) / _WIDE_PX))
         return contact + found[modes:], (self._mean + found[:modes] @ self._modes).reshape(-1, 2)
 
@@ -207,8 +204,14 @@ class ImageCheck:
 
     def _field(self, off: Array, seen: NDArray[np.bool_]) -> Array:
         """Return the (m, 2) px most probable distances of all markers, given those of the seen ones."""
-        known = np.repeat(seen, 2)
-        some = self._modes[:, known]
-        moments = some @ some.T + np.diag(np.square(_NOISE_PX / self._sd))
-        coefficients = np.linalg.solve(moments, some @ (off.ravel() - self._mean)[known])
+        known, ridge = np.repeat(seen, 2).astype(np.float64), np.square(_NOISE_PX / self._sd)
+        coefficients = _fitted(self._modes, off.ravel() - self._mean, known, ridge)
         return (self._mean + coefficients @ self._modes).reshape(-1, 2)
+
+
+def _fitted(rows: Array, values: Array, weight: Array, ridge: Array) -> Array:
+    """Return (k,) how much of each of ``rows`` (k, n) explains ``values`` (n,) best, by weighted ridge regression."""
+    weighted = rows * weight
+    moments = weighted @ rows.T
+    moments.flat[:: len(ridge) + 1] += ridge
+    return np.asarray(np.linalg.solve(moments, weighted @ values))
