@@ -117,3 +117,32 @@ def test_on_a_line_that_is_known_an_edge_is_where_its_distance_says_whatever_its
     felt = read.ahead(RADIUS_M - depth_m)
     search.touched(Contact(felt.x, felt.y, felt.heading, depth_m))
     assert search.edge_on(middle) == pytest.approx(left * 0.5 * width_m, abs=1e-9)
+
+
+@given(st.sampled_from([-1.0, 1.0]), st.floats(0.08, 0.15), st.floats(0.06, 0.1))
+def test_a_corner_that_was_touched_first_does_not_hide_how_the_side_lies(
+    left: float, turned: float, width_m: float
+) -> None:
+    """The first contact and the edge that is found next are the same corner, so that only the other edge tells."""
+    middle = Pose(0.2, 0.1, -0.2)
+    corner = middle.ahead(left * 0.5 * width_m, 0.5 * math.pi)
+    first = Contact(corner.x, corner.y, middle.heading - left * turned)
+    search = EdgeSearch(first, 0.0, width_m, RADIUS_M, left=left)
+    search.touched(Contact(corner.x, corner.y, first.heading_rad - left * 0.3))
+    other = search.opposite()
+    while other.middle is None and not other.failed:
+        tip = other.tip(CLEAR_M)
+        contact = touch(tip, other.direction_rad, middle, width_m)
+        other.missed() if contact is None else other.touched(contact)
+    found, felt_m = search.between(other)
+    assert felt_m == pytest.approx(width_m, abs=1e-3)
+    assert math.dist((found.x_m, found.y_m), (middle.x, middle.y)) < 1e-3
+
+
+def test_two_contacts_6_mm_apart_do_not_tell_how_a_side_lies() -> None:
+    """The first is 6 mm from the edge and 0.5 mm too near; a line through both is turned by 5 deg."""
+    search = EdgeSearch(Contact(0.0, 0.0, 0.0), 0.0, 0.06, RADIUS_M, left=-1.0)
+    search.touched(Contact(0.0005, -0.006, 0.16))
+    assert search.middle is not None
+    assert search.middle.heading_rad == 0.0
+    assert search.left == -1.0

@@ -148,3 +148,18 @@ def test_an_object_too_heavy_for_the_tip_is_given_up(tmp_path, cell):
     pushed = push(cell_file(cell, **SHORT, scene__objects__prism__mass_g=1600), tmp_path)
     assert pushed.path[-2:] == MISSED
     assert "needs more force" in why_missed(pushed)
+
+
+def test_an_object_in_the_way_of_a_step_aside_is_not_pushed_along(tmp_path):
+    """The object is moved 12 mm towards the sensor as that passes by, 8 mm clear of it."""
+    cycles = []
+
+    def move(cell):
+        if cell.task.state == "sidestep":
+            cycles.append(cell.task.state)
+            if len(cycles) == 30:
+                cell.scene.world._sliders["prism"].move((-0.012, 0.0, 0.0), 0.0)
+
+    pushed = push(cell_file(CELL, **SHORT), tmp_path, move)
+    assert pushed.path == [*TOUCH, TO_MIDDLE[0], ("sidestep", "missed", "retract"), MISSED[1]]
+    assert "its way beside the object was taken for free" in why_missed(pushed)

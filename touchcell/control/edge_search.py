@@ -27,7 +27,9 @@ _EDGE_RAD: Final = math.radians(4.0)
 _INWARDS_RAD: Final = math.radians(14.0)
 """Turn of the tip towards the edge's normals: models know tilts to 25 degrees, and turning takes time."""
 _APART_M: Final = 0.005
-"""Distance of two contacts from which the line through them tells how their side is turned."""
+"""Distance up to which two contacts are with the same point of the object."""
+_LINE_M: Final = 0.008
+"""Distance of two contacts from which the line through them tells how their side is turned: points are 0.5 mm wrong."""
 _MOST_TOUCHES: Final = 8
 _LEAST_SINE: Final = 0.12
 """Sine of the normal's turn at an edge from which its distance tells where it is: depths are wrong by 0.03 mm."""
@@ -42,10 +44,18 @@ class EdgeSearch:
         width_m: of the side, as it is expected.
         tip_radius_m: radius of the tip.
         left: 1 for the left edge, -1 for the right one; the nearer one without it.
+        edge: the other edge, where it has been found: then the side is known by it, and has not been touched itself.
     """
 
     def __init__(
-        self, side: Contact, expected_m: float, width_m: float, tip_radius_m: float, *, left: float | None = None
+        self,
+        side: Contact,
+        expected_m: float,
+        width_m: float,
+        tip_radius_m: float,
+        *,
+        left: float | None = None,
+        edge: Pose | None = None,
     ) -> None:
         self._side = Pose(side.x_m, side.y_m, side.heading_rad)
         self._left = left or (-1.0 if expected_m > 0.0 else 1.0)
@@ -57,6 +67,7 @@ class EdgeSearch:
         self._missed_m: float | None = None
         self._step_m = _STEP_M
         self._touches = 0
+        self._known_edge = edge
         self._edge = self._side
         self._edge_touch: Contact | None = None
         self.at_first: Contact | None = None
@@ -67,7 +78,8 @@ class EdgeSearch:
     def opposite(self) -> EdgeSearch:
         """Return the search for the other edge, after this one has been found."""
         assert self.middle is not None
-        return EdgeSearch(self.middle, 0.0, 2.0 * self._half_m, self._tip_radius_m, left=-self._left)
+        width_m = 2.0 * self._half_m
+        return EdgeSearch(self.middle, 0.0, width_m, self._tip_radius_m, left=-self._left, edge=self._edge)
 
     def between(self, other: EdgeSearch) -> tuple[Contact, float]:
         """Return the middle between the edges that two searches have found, and the distance of these."""
@@ -115,11 +127,14 @@ class EdgeSearch:
         self._touches += 1
         turned = math.remainder(contact.heading_rad - self._side.heading, 2.0 * math.pi)
         if abs(turned) > _EDGE_RAD and self._lies_on_turned_side(contact, turned):
+            if self._known_edge is not None:
+                self._turn(self._known_edge, contact)
+                return
             # The first contact was with the edge, whose normal is not the side's.
             edge, towards = self._side, Pose(contact.x_m, contact.y_m, contact.heading_rad)
             self._left = math.copysign(1.0, towards.local((edge.x, edge.y))[1])
             self._find(Pose(edge.x, edge.y, towards.heading), None)
-        elif -self._left * turned > _EDGE_RAD:
+        elif -self._left * turned > _EDGE_RAD and not self._is_other_edge(contact):
             if math.hypot(contact.x_m - self._side.x, contact.y_m - self._side.y) < _APART_M:
                 self.at_first = contact
             self._find(Pose(contact.x_m, contact.y_m, self._side.heading), contact)
@@ -128,12 +143,29 @@ class EdgeSearch:
             self._step()
 
     def _lies_on_turned_side(self, contact: Contact, turned: float) -> bool:
-        """Return True if both contacts lie on one straight side with the normal of the second."""
-        ahead, left = self._side.local((contact.x_m, contact.y_m))
-        if abs(left) < _APART_M:
+        """Return True if a contact and the first one, or the other edge, lie on one straight side with its normal."""
+        start = self._side if self._known_edge is None else self._known_edge
+        ahead, left = Pose(start.x, start.y, self._side.heading).local((contact.x_m, contact.y_m))
+        if abs(left) < _LINE_M:
             return False
         direction = math.atan2(-ahead * math.copysign(1.0, left), abs(left))
         return abs(direction - turned) < abs(direction)
+
+    def _is_other_edge(self, contact: Contact) -> bool:
+        known = self._known_edge
+        return known is not None and math.hypot(contact.x_m - known.x, contact.y_m - known.y) < _LINE_M
+
+    def _turn(self, edge: Pose, contact: Contact) -> None:
+        """Search on along the line from the other edge to a contact with the side, which lies otherwise than was taken.
+
+        The first contact was with that edge, whose normal is not the side's.
+        """
+        outwards = math.atan2(contact.y_m - edge.y, contact.x_m - edge.x)
+        middle = Pose(edge.x, edge.y, outwards - self._left * 0.5 * math.pi)
+        self._side = middle.ahead(self._left * self._half_m, 0.5 * math.pi)
+        self._flat_m, self._missed_m = self._left * self._side.local((contact.x_m, contact.y_m))[1], None
+        self._step_m = _STEP_M
+        self._at_m = max(self._half_m + _BEYOND_M, self._flat_m + _STEP_M)
 
     def _find(self, edge: Pose, touch: Contact | None) -> None:
         self._edge_touch = touch

@@ -277,6 +277,10 @@ class ContactServo:
         self._first_touch: tuple[Array, float] | None = None
         self._goal: Goal | None = None
         self._felt_s = 0.0
+        self._is_clear = False
+        self._most_sigma_rad = math.inf
+        self.blocked = ""
+        """What is in the way of a step aside; empty while nothing is."""
 
     @property
     def has_fresh_data(self) -> bool:
@@ -425,9 +429,11 @@ class ContactServo:
     def start_sidestep(self) -> None:
         """Let go of the object and go where the behavior says; a behavior that never asks keeps its contact."""
         self._goal, self._felt_s = None, 0.0
+        self._is_clear, self.blocked = False, ""
         run = self.sidestepping_run
         if self.T_base_sensor is None or run is None or not run.may_sidestep:
             return
+        self._most_sigma_rad = max(_MOST_SIGMA_RAD, _LESS_SURE * self._normal_sigma_rad())
         run.begin_sidestep(self.T_base_sensor)
         self._goal = run.next_goal(self.T_base_sensor, None)
 
@@ -456,6 +462,7 @@ class ContactServo:
         turn = se3.log(_rotation(R.T @ T_base_goal[:3, :3]))[3:]
         distance_m, angle_rad = float(np.linalg.norm(way)), float(np.linalg.norm(turn))
         V_s = np.zeros(6)
+        self._watch_way(self._goal)
         if self._goal.feels and self.in_contact:
             # Standing still until several frames have shown it.
             self._felt_s += self._period_s
@@ -473,9 +480,28 @@ class ContactServo:
             V_s[3:] = turn * (min(rate, _APPROACH_PER_S * angle_rad) / max(angle_rad, 1e-9))
         return self._accelerated(self._Ad_tcp_sensor @ V_s)
 
+    def _watch_way(self, goal: Goal) -> None:
+        """Take note of a contact on a way that was taken for free, once the sensor is clear of the last one."""
+        if goal.feels:
+            self._is_clear = False
+        elif not self.in_contact:
+            self._is_clear = True
+        elif self._is_clear:
+            self.blocked = f"{self.sensor} touched something where its way beside the object was taken for free"
+
+    def _normal_sigma_rad(self) -> float:
+        """Return the larger standard deviation of the contact's normal; 0 where there is none."""
+        belief = None if self.contact is None else self.contact.belief
+        return 0.0 if belief is None else math.sqrt(float(np.diag(belief.covariance)[3:5].max()))
+
     def _felt_contact(self) -> Array | None:
-        """Return the contact (4, 4) that is felt, as deep as the change of the image says; None where none is valid."""
+        """Return the contact (4, 4) that is felt, as deep as the change of the image says; None where none is valid.
+
+        None, too, where the normal is not known: a tip that is touched 40 deg beside its axis may be read as any.
+        """
         T_s_f, change = self.T_s_f, self.change_since_zero
+        if self._normal_sigma_rad() > self._most_sigma_rad:
+            return None
         if T_s_f is None or self._change_per_m is None or change > LAST_CHANGE:
             return T_s_f
         normal, felt = T_s_f[:3, 2], T_s_f.copy()
@@ -577,6 +603,9 @@ _REACHED_M = 0.5e-3
 _PASSED_M, _PASSED_RAD = 2.5e-3, math.radians(4.0)
 _FEEL_S = 0.15
 _FELT_CHANGE = 0.02
+# Standard deviation of a normal from which it is none: it is 0.5 to 1 deg of touches within the range of a good model,
+# 2 to 4.5 deg of those beside it. A model that is less sure of all is measured by its first contact.
+_MOST_SIGMA_RAD, _LESS_SURE = math.radians(1.5), 2.5
 _LIGHTLY = 0.6
 _APPROACH_PER_S = 12.0
 # Share of the largest acceleration that slows a motion down: arms lag behind what they are told.

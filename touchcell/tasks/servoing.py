@@ -179,7 +179,11 @@ def servo_table(
             *(TransitionDef("missed", state, s.RETRACT) for state in (s.CHECK, s.SETTLE) if needs_feature),
             TransitionDef("lost", s.RUN, s.RETURN, guard="may_return"),
             *(
-                (TransitionDef("aside", s.RUN, s.SIDESTEP), TransitionDef("placed", s.SIDESTEP, s.APPROACH))
+                (
+                    TransitionDef("aside", s.RUN, s.SIDESTEP),
+                    TransitionDef("placed", s.SIDESTEP, s.APPROACH),
+                    TransitionDef("missed", s.SIDESTEP, s.RETRACT),
+                )
                 if sidesteps
                 else ()
             ),
@@ -370,7 +374,9 @@ class ServoTask(MachineTask):
                     self._post("returned")
             case ServoState.SIDESTEP:
                 self._watch_motion(dt_s)
-                if not any(servo.sidestepping for servo in self._servos):
+                if blocked := next((servo.blocked for servo in self._servos if servo.blocked), ""):
+                    self._post("missed", blocked)
+                elif not any(servo.sidestepping for servo in self._servos):
                     self._post("placed")
             case ServoState.RETRACT:
                 if all(servo.travelled_m() >= 1e-3 * self._config.retract_mm for servo in self._servos):
