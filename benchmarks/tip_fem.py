@@ -32,7 +32,7 @@ _RADIUS_M: Final = 0.020
 _STEP_S: Final = 0.0005
 _PRESS_S: Final = 0.3
 _REST_S: Final = 0.3
-_YOUNG_PA: Final = 3e3
+_YOUNG_PA: Final = 1e3
 _POISSON: Final = 0.45
 _FRAMES: Final = 200
 _BLOCK: Final = (0.1, 0.1, 0.04)
@@ -155,7 +155,7 @@ def _elements(geom: str, tip: Tip, depth_m: float, count: int) -> tuple[Array, f
 def _xml(geom: str, count: int, pins: str) -> str:
     spacing = 2.0 * _RADIUS_M / (count - 1)
     return f"""<mujoco>
-      <option timestep="{_STEP_S}" gravity="0 0 0" solver="CG" tolerance="1e-8" integrator="discrete"/>
+      <option timestep="{_STEP_S}" gravity="0 0 0" solver="CG" iterations="300" tolerance="1e-8" integrator="discrete"/>
       <worldbody>
         <body name="part" mocap="true"><geom {geom} solref="0.002 1"/></body>
         <body name="tip" pos="0 0 {_RADIUS_M}">

@@ -24,7 +24,7 @@ _SHORTEST_M: Final = 2e-3
 """The way that is remembered at least."""
 _SHARE: Final = 0.4
 """Of the largest turn that a bend may take, so that corrections have the rest."""
-_HALF_SPEED_RAD: Final = math.radians(1.5)
+_HALF_SPEED_RAD: Final = math.radians(1.0)
 """The tilt at which the speed is halved: a bend that nothing has announced, as at a crease."""
 
 
