@@ -36,6 +36,9 @@ _STILL_RAD: Final = math.radians(45.0)
 _REFERENCE: Final = (0.0, 0.0, 3.0, 0.0, 0.0, 0.0)
 _REFERENCE_SPREAD: Final = (0.5, 0.0, 0.5, 1.5, 1.5, 2.0)
 """Of the contact that a way holds, mm and deg."""
+_ASIDE: Final = 0.7
+_ASIDE_MM: Final = 5.0
+"""Share of the ways beside the edge, and how far: a network that has seen them all in the middle says so of the others."""
 _ERROR_SPREAD: Final = (0.6, 0.0, 0.15, 2.5, 2.5, 4.0)
 """Of the belief, mm and deg, which keeps its error over some frames."""
 _LESS_OR_MORE: Final = (0.3, 1.0, 2.0)
@@ -55,6 +58,7 @@ def contacts_on_way(
     """
     model, radius_m = ContactModel(law), law.tip_radius_m
     reference = np.array(_REFERENCE) + rng.normal(0.0, _REFERENCE_SPREAD)
+    reference[0] += rng.uniform(-_ASIDE_MM, _ASIDE_MM) * (rng.random() < _ASIDE)
     forward, speed_m_s, gain = rng.choice([-1.0, 1.0]), rng.uniform(*_SPEED_M_S), rng.uniform(*_GAIN_PER_S)
     used = np.ones(6) if rng.random() >= _UNTILTED else np.array([1.0, 1.0, 1.0, 0.0, 0.0, 1.0])
     spread = rng.choice(_LESS_OR_MORE) * np.array(_ERROR_SPREAD)
