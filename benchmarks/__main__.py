@@ -44,6 +44,7 @@ BENCHMARKS = {
     "structure": "benchmarks.structure",
     "soak": "tests.fault_injection.soak",
     "steps": "benchmarks.steps",
+    "tip-fem": "benchmarks.tip_fem",
     "tuning": "benchmarks.tuning",
     "cell-fixture": "benchmarks.cell_fixture",
     "world-faults": "benchmarks.world_faults",

@@ -7,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from touchcell.drivers.core.scene import ContactState
+from touchcell.simulation.closed_forms import Box
 from touchcell.simulation.contact import ContactLaw, ContactModel, contact_at
 from touchcell.simulation.motions import Glide, Periodic, Still
 from touchcell.simulation.surfaces import Dome, Plane, Ramp, Surface
@@ -221,3 +222,13 @@ def test_contact_at_agrees_with_the_motion(
     direct = contact_at(wanted, LAW)
     np.testing.assert_allclose(direct.T_f_s, moved.T_f_s, atol=1e-12)
     assert direct.slipping == moved.slipping
+
+
+def test_a_tip_that_comes_out_of_the_other_side_of_a_plate_has_a_contact_there() -> None:
+    # Its nearest point jumps to a face that looks the other way: half a turn of the normal.
+    plate, model = Surface(Box((0.1, 0.1, 0.002))), ContactModel()
+    model.step(euler(0.0, 0.0, 0.019, math.pi, 0.0, 0.0), plate, 0.0)
+    state = model.step(euler(0.0, 0.0, -0.019, math.pi, 0.0, 0.0), plate, 0.0)
+    assert state.in_contact
+    np.testing.assert_allclose(state.T_world_f[:3, 2], [0.0, 0.0, 1.0], atol=1e-12)
+    np.testing.assert_allclose(state.T_world_f[:3, :3].T @ state.T_world_f[:3, :3], np.eye(3), atol=1e-12)

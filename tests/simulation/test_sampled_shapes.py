@@ -6,11 +6,15 @@ import numpy as np
 import pytest
 
 from touchcell.geometry import se3
-from touchcell.simulation.edge_samples import EdgeRanges, edge_contacts
+from touchcell.simulation.contact import ContactLaw
+from touchcell.simulation.edge_samples import EdgeRanges, edge_contacts, frame_on_rim
+from touchcell.simulation.edge_ways import contacts_on_way
 from touchcell.simulation.meshes.mesh_shape import MeshShape
 from touchcell.simulation.random_parts import random_part
 from touchcell.simulation.samples import SampledContact, Variation
 from touchcell.simulation.shape_samples import shape_contacts
+from touchcell.simulation.surfaces import Surface
+from touchcell.simulation.tip import Tip
 
 STILL = Variation(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
@@ -60,3 +64,16 @@ def test_random_parts_have_an_edge_with_their_face_above_and_a_wall_below(seed: 
     face = normals[i, normals[i, :, 2].argmax()]
     middle = 0.5 * (edges.starts[i] + edges.ends[i])
     assert shape.nearest(middle + 0.017 * face).distance_m == pytest.approx(0.017, abs=2e-4)
+
+
+def test_contacts_on_ways_are_held_as_a_controller_holds_them_and_turn_far_at_corners() -> None:
+    rng, law, tip, labels = np.random.default_rng(2), ContactLaw(), Tip(), []
+    for seed in range(6):
+        shape = MeshShape(random_part(np.random.default_rng(seed)), math.radians(30.0))
+        surface = Surface(shape)
+        T_world_e = frame_on_rim(shape, surface, law.tip_radius_m, rng, at_corners=1.0, beside_corner_m=15e-3)
+        labels += [label for label, _ in contacts_on_way(surface, tip, law, T_world_e, rng, 60)]
+    found = np.abs(np.array(labels) - [0.0, 0.0, 3.0, 0.0, 0.0, 0.0])
+    assert len(found) > 50
+    np.testing.assert_array_less(np.median(found, axis=0), [1.0, 2.0, 1.0, 4.0, 4.0, 8.0])
+    assert found[:, 5].max() > 45.0

@@ -19,6 +19,8 @@ _NOISE_M: Final = 0.3e-3
 """A spread of the way that tells as much of the motion as knowing it to be zero."""
 _TIGHTEST_PER_M: Final = 1.0 / 6e-3
 """A corner that is felt in several steps, for no bend of what is followed is tighter."""
+_LEAST_SHARE: Final = 0.8
+"""Of the window, over which a bend has to be felt."""
 _CORNER_RAD: Final = math.radians(12.0)
 """From one estimate to the next: no bend but a corner, behind which nothing is known of the bend."""
 
@@ -47,7 +49,7 @@ class CurvatureEstimator:
         T_base_f = se3.compose(T_base_sensor, T_s_f)
         if self._T_base_f is not None:
             moved = se3.log(se3.compose(se3.inverse(self._T_base_f), T_base_f))
-            if float(np.linalg.norm(moved[3:])) > _CORNER_RAD or np.linalg.norm(self.per_m()[3:]) > _TIGHTEST_PER_M:
+            if float(np.linalg.norm(moved[3:])) > _CORNER_RAD or np.linalg.norm(self._slope()[3:]) > _TIGHTEST_PER_M:
                 self._samples.clear()
             self._moved = self._moved + moved
         self._T_base_f = T_base_f
@@ -58,8 +60,12 @@ class CurvatureEstimator:
     def per_m(self) -> Array:
         """Return the motion (6,) of the contact frame along and about its own axes per metre, 1 and rad/m.
 
-        Zero until enough has been felt.
+        Zero until it has been felt over most of the window: what an estimate errs by behind a corner is no bend.
         """
+        felt_m = self._samples[-1][0] - self._samples[0][0] if self._samples else 0.0
+        return self._slope() if felt_m >= _LEAST_SHARE * self._window_m else np.zeros(6)
+
+    def _slope(self) -> Array:
         if len(self._samples) < _FEWEST:
             return np.zeros(6)
         way = np.array([each for each, _ in self._samples])

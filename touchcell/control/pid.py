@@ -68,6 +68,7 @@ class Pid:
 
     def __init__(self, gains: PidGains) -> None:
         self._gains = gains
+        self._differentiates = bool(gains.kd.any())
         self.reset()
 
     def reset(self) -> None:
@@ -102,20 +103,25 @@ class Pid:
         before = e if self._smoothed is None else self._smoothed
         with np.errstate(over="ignore", invalid="ignore"):
             smoothed = SMOOTHING * e + (1.0 - SMOOTHING) * before
-            near = np.where(np.abs(e) <= gains.integral_zone, e, 0.0)
+            near = e * (np.abs(e) <= gains.integral_zone)
             integral = _clipped(self._integral + gains.ki @ near * dt_s, gains.integral_limit)
-            rest = V_ff + gains.kp @ e + gains.kd @ ((smoothed - before) / dt_s)
-            # Conditional integration: what would push a clipped component farther beyond its limit is not added.
-            beyond = np.abs(rest + integral) > gains.output_limit
-            winding = beyond & ((integral - self._integral) * (rest + integral) > 0.0)
-            integral = np.where(winding, self._integral, integral)
+            rest = V_ff + gains.kp @ e
+            if self._differentiates:
+                rest = rest + gains.kd @ ((smoothed - before) / dt_s)
             output = rest + integral
+            beyond = np.abs(output) > gains.output_limit
+            limited = any(beyond.tolist())
+            if limited:
+                # Conditional integration: what would push a clipped component farther beyond its limit is not added.
+                winding = beyond & ((integral - self._integral) * output > 0.0)
+                integral = np.where(winding, self._integral, integral)
+                output = rest + integral
         if not all_finite(output):
             raise ControlError("e", "is so large that the output overflows", e)
         self._smoothed = smoothed
         self._integral = integral
-        self._clipped = np.abs(output) > gains.output_limit
-        return _clipped(output, gains.output_limit)
+        self._clipped = np.abs(output) > gains.output_limit if limited else beyond
+        return _clipped(output, gains.output_limit) if limited else output
 
 
 def _finite(name: str, value: ArrayLike, *shapes: tuple[int, ...]) -> Array:

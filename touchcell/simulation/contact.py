@@ -18,6 +18,7 @@ from touchcell.simulation.surfaces import Surface
 from touchcell.simulation.timeline import Restore
 
 _IDENTITY = np.eye(4)
+_OPPOSITE = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,19 +120,20 @@ class ContactModel:
         R_b_f = _transport(anchor.R, -nearest.normal)
         slipping = False
 
-        shear = R_b_f[:, :2].T @ (nearest.point - anchor.point)
-        length, longest = math.hypot(shear[0], shear[1]), self.law.max_shear_m(depth)
+        shear_x, shear_y, _ = ((nearest.point - anchor.point) @ R_b_f).tolist()
+        length, longest = math.hypot(shear_x, shear_y), self.law.max_shear_m(depth)
         if length > longest:
             slipping = True
-            shear *= longest / length
+            shear_x, shear_y = shear_x * longest / length, shear_y * longest / length
             dragged = nearest.point + (anchor.point - nearest.point) * (longest / length)
             held = surface.shape.nearest(dragged)
             anchor.point = held.point
             anchor.R = _transport(anchor.R, -held.normal)
             R_b_f = _transport(anchor.R, -nearest.normal)
 
-        R_gamma = R_b_f.T @ R_b_s @ R_tilt.T
-        torsion = math.atan2(R_gamma[1, 0], R_gamma[0, 0])
+        # The first column of the torsion, R_b_f.T @ R_b_s @ R_tilt.T.
+        cos, sin, _ = ((R_b_s @ R_tilt[0]) @ R_b_f).tolist()
+        torsion = math.atan2(sin, cos)
         largest = self.law.max_torsion_rad(depth)
         if abs(torsion) > largest:
             slipping = True
@@ -139,7 +141,7 @@ class ContactModel:
             anchor.R = anchor.R @ about_z(torsion - held_torsion)
             R_b_f = R_b_f @ about_z(torsion - held_torsion)
             torsion = held_torsion
-        position = shear[0], shear[1], depth
+        position = shear_x, shear_y, depth
         return lambda: self._state(T_world_s, R_world_b @ R_b_f, about_z(torsion) @ R_tilt, position, slipping=slipping)
 
     def snapshot(self) -> Restore:
@@ -212,7 +214,9 @@ def _transport(R: Array, z: Array) -> Array:
     (x0, _, a0), (x1, _, a1), (x2, _, a2) = R.tolist()
     b0, b1, b2 = z.tolist()
     # x + v x x + v x (v x x) / (1 + a.b) with v = a x b; x is normal to a, so it is x - (a + b) (b.x) / (1 + a.b).
-    scale = (b0 * x0 + b1 * x1 + b2 * x2) / (1.0 + a0 * b0 + a1 * b1 + a2 * b2)
+    # Where the nearest point jumps to the other side of a plate every half turn is as small: the one about x.
+    toward = 1.0 + a0 * b0 + a1 * b1 + a2 * b2
+    scale = (b0 * x0 + b1 * x1 + b2 * x2) / toward if toward > _OPPOSITE else 0.0
     x0, x1, x2 = x0 - (a0 + b0) * scale, x1 - (a1 + b1) * scale, x2 - (a2 + b2) * scale
     # Rounding would accumulate over thousands of steps of sliding.
     along = x0 * b0 + x1 * b1 + x2 * b2

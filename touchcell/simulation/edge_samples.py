@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import islice
 from typing import Final
 
 import numpy as np
@@ -19,6 +20,7 @@ from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 from touchcell.geometry.vectors import cross
 from touchcell.simulation.contact import ContactLaw, about_z
+from touchcell.simulation.edge_ways import contacts_on_way
 from touchcell.simulation.edges import nearest_edge
 from touchcell.simulation.meshes.mesh_shape import MeshShape
 from touchcell.simulation.pressed import pressed
@@ -40,6 +42,11 @@ _PAST_SPREAD: Final = (1.2, 0.0, 0.7, 3.0, 3.0)
 _CORNER_RAD: Final = math.radians(15.0)
 _BESIDE_CORNER_M: Final = 14e-3
 """As far as a tip at a side feels the next one."""
+_ON_WAYS: Final = 0.6
+"""Of the parts, along which the tip glides as a controller does, rather than being put down anywhere."""
+_BEFORE_CORNER: Final = 0.8
+_BEFORE_M: Final = 15e-3
+_WAY_FRAMES: Final = 60
 _ALONG: Final = 0.5
 _ALONG_MM: Final = 0.1
 """Along the edge nothing is felt: a label within a tenth of a millimetre keeps its scale from being zero."""
@@ -98,18 +105,33 @@ def edge_contacts(
     for start in range(0, n, _IMAGES_PER_TIP):
         tip = Tip(scattered(TipParameters(), variation, rng))
         shape = MeshShape(random_part(rng), _CREASE_RAD)
-        for _ in range(min(_IMAGES_PER_TIP, n - start)):
-            T_e_s, pixels = _contact(shape, tip, ranges, law, rng)
+        made = _on_ways if rng.random() < _ON_WAYS else _anywhere
+        for T_e_s, pixels in islice(made(shape, tip, ranges, law, rng), min(_IMAGES_PER_TIP, n - start)):
             pixels = pixels + rng.normal(0.0, variation.marker_px, pixels.shape)
             seen = rng.random(len(pixels)) >= variation.missing
             radius = tip.parameters.disc_radius_px * (1.0 + rng.normal(0.0, variation.disc_radius))
             yield SampledContact(T_e_s, pixels, seen, float(radius))
 
 
-def _contact(
+def _on_ways(
     shape: MeshShape, tip: Tip, ranges: EdgeRanges, law: ContactLaw, rng: np.random.Generator
-) -> tuple[Array, Array]:
-    """Return T_e_s (4, 4) and pixels (markers, 2) of a contact within the ranges."""
+) -> Iterator[tuple[Array, Array]]:
+    """Yield T_e_s (4, 4) and pixels (markers, 2) of contacts within the ranges, on ways along the rim."""
+    surface = Surface(shape)
+    while True:
+        T_world_e = frame_on_rim(
+            shape, surface, law.tip_radius_m, rng, at_corners=_BEFORE_CORNER, beside_corner_m=_BEFORE_M
+        )
+        for label, pixels in contacts_on_way(surface, tip, law, T_world_e, rng, _WAY_FRAMES):
+            if not ranges.holds(label):
+                break
+            yield _labelled(label, rng), pixels
+
+
+def _anywhere(
+    shape: MeshShape, tip: Tip, ranges: EdgeRanges, law: ContactLaw, rng: np.random.Generator
+) -> Iterator[tuple[Array, Array]]:
+    """Yield T_e_s (4, 4) and pixels (markers, 2) of contacts within the ranges, each by itself."""
     surface, radius_m = Surface(shape), law.tip_radius_m
     while True:
         past = _past_corner(shape, surface, radius_m, rng) if rng.random() < _PAST_CORNER else None
@@ -127,8 +149,13 @@ def _contact(
         state, pixels = pressed(surface, tip, law, dragged_to(T_world_e, T_world_s, ranges, rng), T_world_s)
         if not state.in_contact:
             continue
-        label[1] = rng.uniform(-_ALONG_MM, _ALONG_MM)
-        return se3.from_euler_mm_deg(label), pixels
+        yield _labelled(label, rng), pixels
+
+
+def _labelled(label_mm_deg: Array, rng: np.random.Generator) -> Array:
+    label = label_mm_deg.copy()
+    label[1] = rng.uniform(-_ALONG_MM, _ALONG_MM)
+    return se3.from_euler_mm_deg(label)
 
 
 def frame_on_rim(

@@ -70,7 +70,8 @@ class TwistFollower:
 
     def at_rest(self) -> bool:
         """True if it neither moves nor is about to."""
-        return not (self.velocity.any() or self._target.any())
+        # ndarray.any takes three times as long on arrays this small.
+        return not (any(self.velocity.tolist()) or any(self._target.tolist()))
 
     def snapshot(self) -> Callable[[int], None]:
         """Return a function that restores pose, velocity and command, given the nanoseconds elapsed since."""

@@ -9,7 +9,7 @@ the tip's centre moves (do Carmo, Differential Geometry of Curves and Surfaces, 
 from __future__ import annotations
 
 import math
-from typing import Final
+from typing import Final, TypeAlias
 
 import numpy as np
 
@@ -24,12 +24,18 @@ _SHORTEST_M: Final = 2e-3
 """The way that is remembered at least."""
 _SHARE: Final = 0.4
 """Of the largest turn that a bend may take, so that corrections have the rest."""
-_HALF_SPEED_RAD: Final = math.radians(1.5)
+_HALF_SPEED_RAD: Final = math.radians(1.0)
 """The tilt at which the speed is halved: a bend that nothing has announced, as at a crease."""
+
+
+_Three: TypeAlias = tuple[float, float, float]
+_ZERO: Final[_Three] = (0.0, 0.0, 0.0)
 
 
 class FeltCurvature:
     """Shape operator by least squares over the last stretch of the way, older samples counting less.
+
+    It runs in every cycle, on so few numbers that NumPy's calls would take most of the time.
 
     Args:
         window_m: the way over which the weight of a sample falls to 1/e.
@@ -43,26 +49,37 @@ class FeltCurvature:
         """Forget what was felt."""
         self._weight = 0.0
         self._way_m = 0.0
-        self._at: Array | None = None
-        self._mean_at, self._mean_normal = np.zeros(3), np.zeros(3)
-        self._spread, self._together = np.zeros((3, 3)), np.zeros((3, 3))
-        self._fitted: Array | None = None
+        self._at: _Three | None = None
+        self._mean_at, self._mean_normal = _ZERO, _ZERO
+        # Of a symmetric matrix: xx, xy, xz, yy, yz, zz.
+        self._spread = [0.0] * 6
+        self._together = [_ZERO, _ZERO, _ZERO]
+        self._fitted: list[_Three] | None = None
 
     def update(self, at: Array, normal: Array) -> None:
         """Add the inward unit normal (3,) that was felt with the tip's centre ``at`` (3,) m, both in the base frame."""
-        step_m = 0.0 if self._at is None else float(np.linalg.norm(at - self._at))
-        self._at = at
+        here, felt = _three(at), _three(normal)
+        step_m = 0.0 if self._at is None else math.dist(here, self._at)
+        self._at = here
         self._way_m += step_m
-        off_at, off_normal = at - self._mean_at, normal - self._mean_normal
-        unexpected = 0.0 if not self._weight else float(np.linalg.norm(off_normal - self._operator() @ off_at))
-        kept = math.exp(-step_m / self._window_m) / (1.0 + (unexpected / _UNEXPECTED_RAD) ** 4)
+        x, y, z = off_at = _less(here, self._mean_at)
+        off_normal = _less(felt, self._mean_normal)
+        kept = math.exp(-step_m / self._window_m)
+        if self._weight:
+            unexpected = math.dist(off_normal, _times(self._operator(), off_at))
+            kept /= 1.0 + (unexpected / _UNEXPECTED_RAD) ** 4
         kept = max(kept, math.exp(-step_m / min(_SHORTEST_M, self._window_m)))
         self._weight = kept * self._weight + 1.0
-        share = 1.0 - 1.0 / self._weight
-        self._spread = kept * self._spread + share * np.outer(off_at, off_at)
-        self._together = kept * self._together + share * np.outer(off_normal, off_at)
-        self._mean_at = self._mean_at + off_at / self._weight
-        self._mean_normal = self._mean_normal + off_normal / self._weight
+        part = 1.0 / self._weight
+        share = 1.0 - part
+        products = (x * x, x * y, x * z, y * y, y * z, z * z)
+        self._spread = [kept * old + share * new for old, new in zip(self._spread, products, strict=True)]
+        self._together = [
+            (kept * a + share * n * x, kept * b + share * n * y, kept * c + share * n * z)
+            for (a, b, c), n in zip(self._together, off_normal, strict=True)
+        ]
+        self._mean_at = _less(self._mean_at, off_at, -part)
+        self._mean_normal = _less(self._mean_normal, off_normal, -part)
         self._fitted = None
 
     def turn_rad_per_m(self, direction: Array, normal: Array) -> Array:
@@ -72,17 +89,38 @@ class FeltCurvature:
         """
         if self._way_m < _FEWEST_M:
             return np.zeros(3)
-        x, y, z = normal.tolist()
-        a, b, c = (self._operator() @ direction).tolist()
-        # np.cross is ten times slower.
+        x, y, z = _three(normal)
+        a, b, c = _times(self._operator(), _three(direction))
         return np.array([y * c - z * b, z * a - x * c, x * b - y * a])
 
-    def _operator(self) -> Array:
-        """Return S (3, 3), 1/m."""
+    def _operator(self) -> list[_Three]:
+        """Return the rows of S, 1/m: what was felt together, times the inverse of the spread."""
         if self._fitted is None:
-            least = self._weight * _NOISE_M**2 * np.eye(3)
-            self._fitted = np.asarray(np.linalg.solve(self._spread + least, self._together.T).T, np.float64)
+            xx, xy, xz, yy, yz, zz = self._spread
+            least = self._weight * _NOISE_M**2
+            xx, yy, zz = xx + least, yy + least, zz + least
+            a, b, c = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
+            d, e, f = xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy
+            size = 1.0 / (xx * a + xy * b + xz * c)
+            inverse = [(size * a, size * b, size * c), (size * b, size * d, size * e), (size * c, size * e, size * f)]
+            # The inverse is symmetric: its rows are its columns.
+            self._fitted = [_times(inverse, row) for row in self._together]
         return self._fitted
+
+
+def _three(vector: Array) -> _Three:
+    x, y, z = vector.tolist()
+    return x, y, z
+
+
+def _less(one: _Three, other: _Three, share: float = 1.0) -> _Three:
+    return one[0] - share * other[0], one[1] - share * other[1], one[2] - share * other[2]
+
+
+def _times(rows: list[_Three], vector: _Three) -> _Three:
+    x, y, z = vector
+    (a, b, c), (d, e, f), (g, h, i) = rows
+    return a * x + b * y + c * z, d * x + e * y + f * z, g * x + h * y + i * z
 
 
 class CurvedWay:
@@ -111,7 +149,7 @@ class CurvedWay:
             normal, slower = R @ T_s_f[:3, 2], slower_by_tilt(T_s_f, _HALF_SPEED_RAD)
             self._curvature.update(T_base_sensor[:3, 3], normal)
         turn = R.T @ self._curvature.turn_rad_per_m(R @ direction, normal)
-        bend = float(np.linalg.norm(turn))
+        bend = math.hypot(*turn.tolist())
         self.speed_m_s = min(slower * self._speed_m_s, _SHARE * self._fastest_rad_s / max(bend, 1e-9))
         self.twist = self.speed_m_s * np.concatenate([direction, turn])
         return self.twist

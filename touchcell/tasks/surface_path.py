@@ -155,7 +155,7 @@ class Guide:
         goal_x, goal_y = self._path.point(place.along_m + self._lookahead_m)
         away = math.hypot(goal_x - x, goal_y - y)
         ahead = (goal_x - x, goal_y - y) if away > 1e-9 else self._path.direction(place.along_m)
-        wanted = R @ np.array([*ahead, 0.0])
+        wanted = R[:, :2] @ ahead
         axis, up = T_base_sensor[:3, 2], R[:, 2]
         steepness = float(axis @ up)
         if abs(steepness) > _STEEPEST_COS:
@@ -163,5 +163,5 @@ class Guide:
         else:
             wanted = wanted - float(wanted @ axis) * axis
         direction: Array = T_base_sensor[:3, :3].T @ wanted
-        length = float(np.linalg.norm(direction))
+        length = math.hypot(*direction.tolist())
         return direction / length if length > 1e-12 else np.array([1.0, 0.0, 0.0])
