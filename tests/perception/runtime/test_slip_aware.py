@@ -11,7 +11,7 @@ from touchcell.geometry.gaussian import PoseGaussian
 from touchcell.perception.models.labels import xi_gaussian
 from touchcell.perception.runtime.filter import PoseFilter, isotropic_noise
 from touchcell.perception.runtime.filter_spec import ContactFilter
-from touchcell.perception.runtime.slip_aware import SlipAwareConfig, SlipAwareFilter
+from touchcell.perception.runtime.slip_aware import SlipAwareConfig, SlipAwareFilter, _innovation
 from touchcell.perception.runtime.stick_slip import StickSlipFilter
 from touchcell.simulation.contact import ContactLaw
 from touchcell.simulation.sequences import Sequence, random_sequence
@@ -133,9 +133,25 @@ def test_the_shear_of_a_first_frame_is_no_larger_than_its_depth() -> None:
     np.testing.assert_allclose(found[2:5], shown[2:5], atol=0.05)
 
 
+def test_a_frame_is_expected_to_follow_contact_and_slide_as_their_derivatives_say() -> None:
+    prior = se3.inverse(se3.from_euler_mm_deg(np.array([1.0, -2.0, 3.0, 12.0, -9.0, 4.0])))
+    slide, step = np.array([2e-3, -1.5e-3, 0.06]), 1e-6
+    turn = se3.from_euler_mm_deg(np.array([2.0, -1.5, 0.0, 0.0, 0.0, np.degrees(0.06)]))
+    shown = PoseGaussian(se3.compose(prior, turn), np.diag(SIGMA**2))
+    e, _, H = _innovation(shown, prior, slide)
+    np.testing.assert_allclose(e, 0.0, atol=1e-12)
+    for i in range(9):
+        d = step * np.eye(9)[i]
+        moved, _, _ = _innovation(shown, se3.compose(se3.exp(d[:6]), prior), slide + d[6:])
+        np.testing.assert_allclose(-moved / step, H[:, i], atol=1e-5)
+
+
 def test_what_is_no_pose_is_refused_and_changes_nothing() -> None:
     contact_filter = slip_aware()
     observed, sensors = slid_contact(2)
+    with pytest.raises(GeometryError):
+        contact_filter.update(observed[0], np.full((4, 4), np.nan), 0)
+    assert contact_filter.state is None
     state = contact_filter.update(observed[0], sensors[0], 0)
     with pytest.raises(GeometryError):
         contact_filter.update(observed[1], np.full((4, 4), np.nan), PERIOD_NS)
