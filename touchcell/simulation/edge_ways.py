@@ -36,9 +36,9 @@ _STILL_RAD: Final = math.radians(45.0)
 _REFERENCE: Final = (0.0, 0.0, 3.0, 0.0, 0.0, 0.0)
 _REFERENCE_SPREAD: Final = (0.5, 0.0, 0.5, 1.5, 1.5, 2.0)
 """Of the contact that a way holds, mm and deg."""
-_ASIDE: Final = 0.7
+_ASIDE: Final = 0.6
 _ASIDE_MM: Final = 5.0
-"""Share of the ways beside the edge, and how far: a network that has seen them all in the middle says so of the others."""
+"""Share of the ways beside the edge, and how far: a network that has seen all in the middle says so of the others."""
 _ERROR_SPREAD: Final = (0.6, 0.0, 0.15, 2.5, 2.5, 4.0)
 """Of the belief, mm and deg, which keeps its error over some frames."""
 _LESS_OR_MORE: Final = (0.3, 1.0, 2.0)
