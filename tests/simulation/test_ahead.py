@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from touchcell.geometry import se3
-from touchcell.simulation.ahead import remark_on_approach, remark_on_edge, start_near
+from touchcell.simulation.ahead import remark_on_approach, remark_on_edge, start_near, way_along_edge
 from touchcell.simulation.closed_forms import Box
 from touchcell.simulation.surfaces import Sphere, Surface
 
@@ -64,3 +64,19 @@ def test_a_contact_that_is_not_with_an_edge_is_named(start_mm_deg: tuple[float, 
     T_world_s = se3.from_euler_mm_deg(np.array(start_mm_deg))
     found = remark_on_edge([SURFACES["block"]], T_world_s, 0.020, 0.050)
     assert (found is None) if remark is None else (found is not None and found.startswith(remark)), found
+
+
+@pytest.mark.parametrize("step_m", [0.004, -0.004])
+def test_the_edge_of_a_block_leads_once_around_it(step_m: float) -> None:
+    T_world_s = se3.from_euler_mm_deg(np.array([48.0, 0.0, 45.0, 180.0, 0.0, 0.0]))
+    way = way_along_edge([SURFACES["block"]], T_world_s, 0.020, 0.050, 1.0, step_m)
+    assert way is not None
+    np.testing.assert_allclose([way.min(axis=0)[:2], way.max(axis=0)[:2]], [[-0.05, -0.05], [0.05, 0.05]], atol=5e-4)
+    assert np.linalg.norm(np.diff(way, axis=0), axis=1).sum() == pytest.approx(0.4, abs=0.01)
+    # The sensor looks down with x outwards: its y axis has the face to its left.
+    assert np.sign(way[1, 1] - way[0, 1]) == -np.sign(step_m)
+
+
+def test_no_edge_is_followed_where_none_is_met() -> None:
+    T_world_s = se3.from_euler_mm_deg(np.array([300.0, 0.0, 45.0, 180.0, 0.0, 0.0]))
+    assert way_along_edge([SURFACES["block"]], T_world_s, 0.020, 0.050, 1.0, 0.004) is None

@@ -31,6 +31,9 @@ _INSIDE_EDGE_M: Final = 8e-3
 _BEYOND_EDGE_M: Final = 5e-3
 _MOST_TURN_RAD: Final = math.radians(60.0)
 _AT_EDGE_MM_DEG: Final = np.array([-2.0, 0.0, -5.0, 0.0, 0.0, 0.0])
+_ON_FACE_M: Final = 0.5e-3
+"""How far inside its edge a tip is moved along, so that at a corner the next edge is the nearer one."""
+_FEWEST_OF_LOOP: Final = 8
 _FAR: Final = 4.0
 """How much further than the reach is searched, to say how far away the surface is."""
 
@@ -85,6 +88,40 @@ def remark_on_edge(surfaces: Sequence[Surface], T_world_s: Array, tip_radius_m: 
             "it, away from the face"
         )
     return None
+
+
+def way_along_edge(
+    surfaces: Sequence[Surface],
+    T_world_s: Array,
+    tip_radius_m: float,
+    reach_m: float,
+    distance_m: float,
+    step_m: float,
+) -> Array | None:
+    """Return the way (n, 3), m, of a tip along the edge that it meets, until the way is long enough or closed.
+
+    Args:
+        surfaces: what stands still.
+        T_world_s: (4, 4) pose of the sensor, from which it moves along its z axis.
+        tip_radius_m: radius of the tip.
+        reach_m: distance within which it makes contact.
+        distance_m: length of the way.
+        step_m: from point to point along the edge's y axis; negative against it.
+    """
+    met = _contact_pose(surfaces, T_world_s, tip_radius_m, reach_m)
+    T_world_e = None if met is None else nearest_edge(surfaces, met, 0.0, tip_radius_m)
+    if T_world_e is None:
+        return None
+    way = [T_world_e[:3, 3]]
+    ahead = np.eye(4)
+    ahead[:2, 3] = -_ON_FACE_M, step_m
+    for _ in range(math.ceil(distance_m / abs(step_m))):
+        T_world_e = nearest_edge(surfaces, se3.compose(T_world_e, ahead), 0.0, tip_radius_m)
+        assert T_world_e is not None
+        way.append(T_world_e[:3, 3])
+        if len(way) > _FEWEST_OF_LOOP and float(np.linalg.norm(way[-1] - way[0])) < abs(step_m):
+            break
+    return np.array(way)
 
 
 def start_near(

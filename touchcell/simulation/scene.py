@@ -27,6 +27,7 @@ from touchcell.simulation.ahead import (
     remark_on_approach,
     remark_on_edge,
     start_near,
+    way_along_edge,
     way_over,
 )
 from touchcell.simulation.bodies import scene_bodies
@@ -44,6 +45,7 @@ from touchcell.simulation.world import DeferredContact, KinematicWorld, World, c
 
 HISTORY_S = 5.0
 _RIDE_STEPS = 100
+_RIM_STEP_M = 4e-3
 
 
 class ContactNotKept(TouchcellError, LookupError):
@@ -549,6 +551,13 @@ class SceneConfig(Section, SceneSection):
         if not (surfaces := self._still()):
             return None
         return points_over(surfaces, T_world_s, points, 1e-3 * self.tip.radius_mm - depth_m, reach_m)
+
+    def way_along_edge(
+        self, T_world_s: Array, distance_m: float, reach_m: float, *, backward: bool = False
+    ) -> Array | None:
+        """Return the way along an edge of surfaces that stand still; None where anything moves, or no edge is met."""
+        step_m = -_RIM_STEP_M if backward else _RIM_STEP_M
+        return way_along_edge(self._still(), T_world_s, 1e-3 * self.tip.radius_mm, reach_m, distance_m, step_m)
 
     def has_edges(self) -> bool:
         """Return whether a surface has an edge."""

@@ -7,7 +7,7 @@ and tilt against the face, lateral offset across the edge, turn about the normal
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Annotated, Final, Literal
 
 import numpy as np
@@ -22,6 +22,7 @@ from touchcell.perception.runtime.feature_spec import EDGE
 from touchcell.tasks.contact_servo import ContactServo, SixGains
 from touchcell.tasks.felt_curvature import slower_by_tilt
 from touchcell.tasks.interface import DEPTH, SPEED, TaskContext, TaskSpec
+from touchcell.tasks.planned_motions import PlannedMotion, PlannedRim
 from touchcell.tasks.servoing import ARM, SENSOR, ServoConfig, ServoTask, servo_motions
 
 _AXES: Final = {
@@ -196,6 +197,12 @@ def _build(config: EdgeFollowingConfig, context: TaskContext) -> ServoTask:
     return ServoTask("edge_following", config, context, servo, shears=False)
 
 
+def _motions(config: EdgeFollowingConfig) -> Iterator[PlannedMotion]:
+    yield from servo_motions(config, shears=False)
+    backward = config.direction == "backward"
+    yield PlannedRim(("distance_mm",), 1e-3 * config.distance_mm, backward, config.close_loop)
+
+
 SPEC = TaskSpec(
     "edge_following",
     "glide along an edge, half over it and turning with it, round corners and loops",
@@ -205,5 +212,5 @@ SPEC = TaskSpec(
     _build,
     starts_free=True,
     feature=EDGE.name,
-    motions=lambda config, start, mount: servo_motions(config, shears=False),
+    motions=lambda config, start, mount: _motions(config),
 )

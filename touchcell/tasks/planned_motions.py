@@ -168,6 +168,23 @@ class Impossible:
     hint: str
 
 
+@dataclass(frozen=True, slots=True)
+class PlannedRim:
+    """A way along the edge that is met first, in contact.
+
+    Attributes:
+        key: of the task's parameter that says how far.
+        distance_m: along the edge, at most.
+        backward: with the face to the right of the travel, seen from above it.
+        closes: the way has to lead back to where it began.
+    """
+
+    key: Key
+    distance_m: float
+    backward: bool
+    closes: bool
+
+
 PlannedMotion: TypeAlias = (
     PlannedStart
     | PlannedTurn
@@ -177,5 +194,6 @@ PlannedMotion: TypeAlias = (
     | PlannedTime
     | PlannedTouch
     | PlannedRide
+    | PlannedRim
     | Impossible
 )

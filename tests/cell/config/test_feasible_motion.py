@@ -20,7 +20,7 @@ from touchcell.errors import ConfigError
 from touchcell.paths import CONFIGS
 
 SHIPPED = {path.stem: load_layers(path).data for path in CONFIGS.glob("*_sim.yaml")}
-FOLLOW, PUSH, STEPS = "surface_follow_sim", "single_push_sim", "steps_sim"
+FOLLOW, PUSH, STEPS, EDGE = "surface_follow_sim", "single_push_sim", "steps_sim", "edge_follow_sim"
 TOUCH = {"move": {"by_mm_deg": [0, 0, 40], "until": {"contact": True}}}
 PRESS = {"servo": {"depth_mm": 2, "until": {"time_s": 1}}}
 Change = tuple[str, Any]
@@ -183,6 +183,13 @@ FAILING = [
         "arms.arm.limits.tcp_speed_m_s",
         "150 mm/s is less than what 'sensor' is carried along with: it falls 60 mm behind",
     ),
+    (
+        EDGE,
+        [("interlocks.workspace.min_mm", [-40, -120, 10])],
+        "task.distance_mm",
+        r"mm the edge leads out of interlocks.workspace, which would trip: x = -4",
+    ),
+    (EDGE, [("task.distance_mm", 200)], "task.distance_mm", "200 mm along the edge do not lead back"),
 ]
 
 
@@ -206,6 +213,7 @@ ACCEPTED = [
     (FOLLOW, [("interlocks.tcp_speed.limit_rad_s", 0.5)]),
     (FOLLOW, [("interlocks.workspace.max_mm", [110, 50, 150])]),
     (FOLLOW, [("task.depth_mm", 4.5)]),
+    (EDGE, [("task.close_loop", False), ("task.distance_mm", 200)]),
     # A run may be ended before its task is.
     (FOLLOW, [("max_duration_s", 5)]),
     (PUSH, [("task.target_mm", [-120, 0]), ("task.goal_heading_deg", 180)]),

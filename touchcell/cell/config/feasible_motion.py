@@ -23,6 +23,7 @@ from touchcell.tasks.planned_motions import (
     PlannedHold,
     PlannedMotion,
     PlannedRide,
+    PlannedRim,
     PlannedSlide,
     PlannedStart,
     PlannedTime,
@@ -63,7 +64,7 @@ def failing_motions(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
 
     Such a cell may be meant, as in a test of that very end, and is not refused.
     """
-    for problems in (_impossible, _times, _unmet, _left_behind):
+    for problems in (_impossible, _times, _unmet, _left_behind, _along_edge):
         yield from problems(file, plan)
 
 
@@ -249,6 +250,40 @@ def _left_behind(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
                 f"it falls {1e3 * farthest_m:.0f} mm behind",
                 value=limits.tcp_speed_m_s,
                 hint="raise it, with interlocks.tcp_speed and the margins, or let the object move more slowly",
+            )
+
+
+def _along_edge(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
+    """Edges of the scene that lead out of a box that the arm must not leave, or that do not lead back in time."""
+    first = _first_approach(plan)
+    for motion in _motions(plan) if first is not None else ():
+        if first is None or not isinstance(motion, PlannedRim):
+            continue
+        way_m = first.scene.way_along_edge(
+            first.T_world_sensor, motion.distance_m, first.reach_m, backward=motion.backward
+        )
+        if way_m is None:
+            continue
+        steps_m = np.linalg.norm(np.diff(way_m, axis=0), axis=1)
+        for rule, box in _boxes(plan).items():
+            if box.sensor not in plan.sensor_roles:
+                continue
+            inner_mm = 1e3 * first.in_base(way_m)
+            out = [i for i, at_mm in enumerate(inner_mm) if _outside(at_mm, box, _WAY_SLACK_MM)]
+            if out:
+                yield file.problem(
+                    ("task", *motion.key),
+                    f"after {1e3 * steps_m[: out[0]].sum():.0f} mm the edge leads out of interlocks.{rule}, which "
+                    f"would trip: {_outside(inner_mm[out[0]], box, _WAY_SLACK_MM)}",
+                    hint="go less far, or make the workspace larger",
+                )
+                return
+        if motion.closes and np.linalg.norm(way_m[-1] - way_m[0]) > _REACH_SLACK_M:
+            yield file.problem(
+                ("task", *motion.key),
+                f"{1e3 * motion.distance_m:g} mm along the edge do not lead back to where it begins",
+                value=1e3 * motion.distance_m,
+                hint="allow more, or leave out `close_loop`",
             )
 
 

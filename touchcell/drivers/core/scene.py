@@ -190,6 +190,21 @@ class SceneSection(BaseModel):
         """
         return None
 
+    def way_along_edge(
+        self, T_world_s: Array, distance_m: float, reach_m: float, *, backward: bool = False
+    ) -> Array | None:
+        """Return the way (n, 3), m, of a tip that approaches along its axis and then follows the edge that it meets.
+
+        It ends where it leads back to where it began. None where it meets no edge, or what it touches moves.
+
+        Args:
+            T_world_s: (4, 4) pose of the sensor at the start.
+            distance_m: along the edge.
+            reach_m: within which it makes contact.
+            backward: with the face to the right of the travel, seen from above it.
+        """
+        return None
+
     def has_edges(self) -> bool:
         """Return whether anything in it has an edge that could be followed."""
         return True
