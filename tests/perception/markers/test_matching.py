@@ -156,6 +156,13 @@ def test_images_without_a_lattice_raise() -> None:
         learn_markers([Discs(np.empty((0, 2)), np.empty(0))] * 10, SIZE)
 
 
+def test_too_few_images_are_said_to_be_too_few_before_they_are_matched() -> None:
+    place = np.zeros((331, 2))
+    with pytest.raises(TrainingError, match="45 images are too few") as refused:
+        learn_markers([Discs(place, np.full(331, 120.0))] * 45, SIZE, reference=place)
+    assert "48 are needed" in refused.value.hint
+
+
 def test_principal_components_fill_unseen_markers() -> None:
     rng = np.random.default_rng(3)
     reference = rng.uniform(0.0, 100.0, (20, 2))

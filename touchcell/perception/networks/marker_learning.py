@@ -178,8 +178,12 @@ def learn_markers(
     Raises:
         TrainingError: there is no such lattice in the frames, or too few of them can be matched.
     """
+    needed = max(2 * modes, len(frames) // 4)
     if reference is None:
         reference = find_reference(frames, rings)
+    if len(frames) < needed:
+        # Known before minutes of matching.
+        raise TrainingError(f"{len(frames)} images are too few to learn markers from", hint=f"{needed} are needed")
     displacements = DISPLACEMENT_PRIORS.load("simulated")(reference, rings, seed)
     everything = np.ones(displacements.shape[:2], bool)
     model = DisplacementModel.fit(reference, displacements, everything, modes)
@@ -199,10 +203,10 @@ def learn_markers(
         for _ in range(_SPREADS):
             _spread(matcher, frames, fields, density)
         good = [field for field in fields if _surely(field)]
-        if len(good) < max(2 * modes, len(frames) // 4):
+        if len(good) < needed:
             raise TrainingError(
-                f"only {len(good)} of {len(frames)} images could be matched",
-                hint="check threshold, crop, mask and the number of rings",
+                f"only {len(good)} of {len(frames)} images could be matched, {needed} are needed",
+                hint="check threshold, crop, mask and the number of rings, or give more images",
             )
         if number > 0:
             # In later rounds misfits are outliers rather than errors of a coarse model.
