@@ -51,3 +51,11 @@ def test_evaluate_names_what_is_missing(tmp_path: Path, capsys: pytest.CaptureFi
     model.write_bytes(b"short")
     assert main(["evaluate", "--data", str(tmp_path), "--model", str(model)]) == EXIT_BAD_INPUT
     assert str(tmp_path) in capsys.readouterr().err
+
+
+def test_a_model_that_ships_is_named_on_the_command_line_as_in_a_cell_file(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["adapt", "--model", "builtin:sim_franka_tactip_1", "--data", str(tmp_path), "--out", str(tmp_path / "m")]
+    assert main(words) == EXIT_BAD_INPUT
+    assert "sim_franka_tactip_1.safetensors: camera: was adapted already" in capsys.readouterr().err

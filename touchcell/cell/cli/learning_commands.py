@@ -31,7 +31,7 @@ def add_parser(commands: Subparsers) -> None:
     evaluate = add_command(commands, "evaluate", _evaluate, "measure error, likelihood and latency on labelled images")
     _add_data(evaluate, "data set folder with train/, val/ or test/")
     evaluate.add_argument("--split", choices=("train", "val", "test"), default="val", help="(default: %(default)s)")
-    evaluate.add_argument("--model", type=Path, required=True, metavar="FILE", help="model file")
+    evaluate.add_argument("--model", type=_model, required=True, metavar="FILE", help="model file")
     evaluate.add_argument("--calibration", type=Path, metavar="FILE", help="file of `touchcell calibrate`")
     evaluate.add_argument("--deeper-than", type=float, metavar="MM", help="leave out shallower contacts")
     evaluate.add_argument("--json", type=Path, metavar="FILE", help="also write the figures there")
@@ -101,7 +101,7 @@ def _add_training(commands: Subparsers) -> None:
     check = add_command(
         commands, "train-check", _train_check, "learn which images an image network must refuse; the network stays"
     )
-    check.add_argument("--model", type=Path, required=True, metavar="FILE", help="model file of a gdn or cnn")
+    check.add_argument("--model", type=_model, required=True, metavar="FILE", help="model file of a gdn or cnn")
     _add_out(check, "model file to write (.safetensors)")
     check.add_argument("--data", type=Path, metavar="DIR", help="its data set (default: images as of train-sim)")
     check.add_argument(
@@ -128,7 +128,7 @@ def _add_calibration(commands: Subparsers) -> None:
     calibrate = add_command(
         commands, "calibrate", _calibrate, "find zoom, turn and shift of a camera from images out of contact"
     )
-    calibrate.add_argument("--model", type=Path, required=True, metavar="FILE", help="model file")
+    calibrate.add_argument("--model", type=_model, required=True, metavar="FILE", help="model file")
     _add_out(calibrate, "calibration file to write (.yaml)")
     source = calibrate.add_mutually_exclusive_group(required=True)
     source.add_argument("--frames", type=Path, metavar="DIR", help="folder with images of the tip out of contact")
@@ -144,7 +144,7 @@ def _add_calibration(commands: Subparsers) -> None:
     adapt = add_command(
         commands, "adapt", _adapt, "bring a marker estimator to another sensor by a few labelled images"
     )
-    adapt.add_argument("--model", type=Path, required=True, metavar="FILE", help="model file of a marker estimator")
+    adapt.add_argument("--model", type=_model, required=True, metavar="FILE", help="model file of a marker estimator")
     _add_data(adapt, "data set folder with train/ of the new sensor")
     adapt.add_argument("--frames", type=positive, help="so many of its images, evenly over the depths (default: all)")
     _add_out(adapt, "model file to write (.safetensors)")
@@ -260,6 +260,13 @@ def _calibrate(options: argparse.Namespace) -> int:
     )
     print(f"{change.frames} images; wrote {options.out}")
     return EXIT_OK
+
+
+def _model(name: str) -> Path:
+    """Return the model file that a command line names, as a cell file would: a path, or ``builtin:NAME``."""
+    from touchcell.perception.runtime.network_estimator import model_path
+
+    return model_path(name)
 
 
 def _adapt(options: argparse.Namespace) -> int:
