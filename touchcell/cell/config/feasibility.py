@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from touchcell.cell.config.demands import demands
 from touchcell.cell.config.rule_limits import is_kind, limits_of
-from touchcell.cell.config.starts import given_start, pose_of, start_near, start_of_arm
+from touchcell.cell.config.starts import given_start, sensor_in_world, start_near
 from touchcell.cell.config.yaml_file import YamlFile
 from touchcell.drivers.core.arm import LimitsConfig
 from touchcell.drivers.core.scene import scene_section
@@ -225,13 +225,8 @@ def _contacts(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
     around = plan.cell.emulated_scene if plan.cell.world == "emulated" else plan.cell.scene
     if around is None or not plan.task.starts_free or plan.cell.truth is not None:
         return
-    tips, arms = {}, {}
-    for name in plan.sensor_roles.values():
-        sensor = plan.cell.sensors[name]
-        if sensor.mounted_on is not None and (start := start_of_arm(plan, sensor.mounted_on)) is not None:
-            base = pose_of(plan.cell.arms[sensor.mounted_on].base_pose_mm_deg)
-            if base is not None:
-                arms[name], tips[name] = sensor.mounted_on, base @ start @ sensor.T_tcp_sensor
+    known = {name: sensor_in_world(plan, name) for name in plan.sensor_roles.values()}
+    tips = {name: T for name, T in known.items() if T is not None}
     scene = scene_section().model_validate(around)
     try:
         pressed = scene.pressed(tips)
@@ -245,7 +240,7 @@ def _contacts(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
     for name, depth_m in pressed.items():
         other = start_near(plan, scene, name)
         yield file.problem(
-            ("arms", arms[name], "start_pose_mm_deg"),
+            ("arms", str(plan.cell.sensors[name].mounted_on), "start_pose_mm_deg"),
             f"the tip of {name!r} is {1e3 * depth_m:.1f} mm deep in something there, but the task starts free",
             hint=f"start clear of it, as with {other}" if other else "start farther away",
         )

@@ -11,7 +11,7 @@ import numpy as np
 
 from touchcell.cell.config.demands import demands
 from touchcell.cell.config.rule_limits import is_kind, limits_of
-from touchcell.cell.config.starts import pose_of, start_of_arm, start_of_sensor
+from touchcell.cell.config.starts import pose_of, sensor_in_world, start_of_sensor
 from touchcell.cell.config.yaml_file import KeyPath, YamlFile
 from touchcell.drivers.core.arm import LimitsConfig
 from touchcell.drivers.core.scene import scene_section
@@ -187,7 +187,7 @@ def _first_approach(plan: CellPlan) -> _Approach | None:
     if plan.cell.scene is None or not plan.sensor_roles or reach_mm is None:
         return None
     sensor = _first_sensor(plan)
-    arm, tip = plan.cell.sensors[sensor].mounted_on, _tip(plan, sensor)
+    arm, tip = plan.cell.sensors[sensor].mounted_on, sensor_in_world(plan, sensor)
     if arm is None or tip is None:
         return None
     scene = scene_section().model_validate(plan.cell.scene)
@@ -227,13 +227,12 @@ def _lifted_out(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
 
 def _left_behind(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
     """Motions of what a contact goes along with that its arm cannot keep up with."""
-    first = _first_approach(plan)
+    rides = [motion for motion in _motions(plan) if isinstance(motion, PlannedRide)]
+    first = _first_approach(plan) if rides else None
     limits = None if first is None else getattr(plan.arms[first.arm].config, "limits", None)
     if first is None or not isinstance(limits, LimitsConfig):
         return
-    for motion in _motions(plan):
-        if not isinstance(motion, PlannedRide):
-            continue
+    for motion in rides:
         way_m = first.scene.ride(first.T_world_sensor, first.reach_m, motion.lasts_s)
         if way_m is None:
             continue
@@ -255,10 +254,11 @@ def _left_behind(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
 
 def _along_edge(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
     """Edges of the scene that lead out of a box that the arm must not leave, or that do not lead back in time."""
-    first = _first_approach(plan)
-    for motion in _motions(plan) if first is not None else ():
-        if first is None or not isinstance(motion, PlannedRim):
-            continue
+    rims = [motion for motion in _motions(plan) if isinstance(motion, PlannedRim)]
+    first = _first_approach(plan) if rims else None
+    if first is None:
+        return
+    for motion in rims:
         way_m = first.scene.way_along_edge(
             first.T_world_sensor, motion.distance_m, first.reach_m, backward=motion.backward
         )
@@ -428,7 +428,7 @@ def _unmet(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
     reach_mm = getattr(plan.task_config, "approach_distance_mm", None)
     if reach_mm is not None:
         for name in plan.sensor_roles.values():
-            tip = _tip(plan, name)
+            tip = sensor_in_world(plan, name)
             if tip is not None and not scene.meets(tip, (1e-3 * reach_mm + _REACH_SLACK_M) * tip[:3, 2]):
                 yield file.problem(
                     ("task", "approach_distance_mm"),
@@ -443,7 +443,7 @@ def _unmet(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
     for motion in _motions(plan):
         if not isinstance(motion, PlannedTouch) or motion.key in reported:
             continue
-        tip = _tip(plan, name, motion.T_base_tcp)
+        tip = sensor_in_world(plan, name, motion.T_base_tcp)
         arm = plan.cell.sensors[name].mounted_on
         base = None if arm is None else pose_of(plan.cell.arms[arm].base_pose_mm_deg)
         if tip is not None and base is not None and not scene.meets(tip, base[:3, :3] @ motion.way_m, motion.depth_m):
@@ -456,16 +456,6 @@ def _unmet(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
             )
 
 
-def _tip(plan: CellPlan, sensor: str, T_base_tcp: Array | None = None) -> Array | None:
-    """Return the pose (4, 4) of a sensor in the world, at the start or with the tool at a pose; None if unknown."""
-    section = plan.cell.sensors[sensor]
-    if section.mounted_on is None:
-        return None
-    T = start_of_arm(plan, section.mounted_on) if T_base_tcp is None else T_base_tcp
-    base = pose_of(plan.cell.arms[section.mounted_on].base_pose_mm_deg)
-    return None if T is None or base is None else base @ T @ section.T_tcp_sensor
-
-
 def _untouched(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
     """Steps that hold a contact before anything is touched."""
     if not plan.sensor_roles:
@@ -476,7 +466,7 @@ def _untouched(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
         if not isinstance(motion, PlannedHold) or motion.key in reported:
             continue
         after = motion.after
-        tip = None if motion.T_base_tcp is None else _tip(plan, name, motion.T_base_tcp)
+        tip = None if motion.T_base_tcp is None else sensor_in_world(plan, name, motion.T_base_tcp)
         if not after and plan.cell.scene is not None and tip is not None:
             scene = scene_section().model_validate(plan.cell.scene)
             after = "" if scene.touches(tip) else f"standing clear of the scene with {name!r}"

@@ -41,6 +41,16 @@ def start_of_sensor(plan: CellPlan) -> tuple[Array | None, Array]:
     return start, sensor.T_tcp_sensor
 
 
+def sensor_in_world(plan: CellPlan, sensor: str, T_base_tcp: Array | None = None) -> Array | None:
+    """Return the pose (4, 4) of a sensor in the world, at the start or with the tool at a pose; None if unknown."""
+    section = plan.cell.sensors[sensor]
+    if section.mounted_on is None:
+        return None
+    T = start_of_arm(plan, section.mounted_on) if T_base_tcp is None else T_base_tcp
+    base = pose_of(plan.cell.arms[section.mounted_on].base_pose_mm_deg)
+    return None if T is None or base is None else base @ T @ section.T_tcp_sensor
+
+
 def start_near(plan: CellPlan, scene: SceneSection, sensor: str) -> str:
     """Return, for people, a start of a sensor's arm from which it comes upon what it has to touch.
 
@@ -48,15 +58,13 @@ def start_near(plan: CellPlan, scene: SceneSection, sensor: str) -> str:
     """
     section = plan.cell.sensors[sensor]
     reach_mm = getattr(plan.task_config, "approach_distance_mm", None)
-    arm = section.mounted_on
-    if reach_mm is None or arm is None or (start := start_of_arm(plan, arm)) is None:
+    arm, T_world_s = section.mounted_on, sensor_in_world(plan, sensor)
+    if reach_mm is None or arm is None or T_world_s is None:
         return ""
-    T_world_base = plan.cell.arms[arm].T_world_base
-    T_world_s = T_world_base @ start @ section.T_tcp_sensor
     found = scene.start_near(T_world_s, 1e-3 * reach_mm, on_edge=plan.task.feature == "edge")
     if found is None:
         return ""
-    T_base_tcp = se3.inverse(T_world_base) @ found @ se3.inverse(section.T_tcp_sensor)
+    T_base_tcp = se3.inverse(plan.cell.arms[arm].T_world_base) @ found @ se3.inverse(section.T_tcp_sensor)
     numbers = ", ".join(f"{value:g}" for value in np.round(se3.to_euler_mm_deg(T_base_tcp), 1) + 0.0)
     return f"arms.{arm}.start_pose_mm_deg: [{numbers}]"
 
