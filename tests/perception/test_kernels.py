@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from itertools import pairwise
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -12,6 +13,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from numpy.typing import NDArray
 
 from tests.helpers.compiled import extension
 from touchcell.geometry.types import Array, ImageArray
@@ -164,15 +166,90 @@ def change(basis: Array, weight: Array, off: Array, from_start: Array, ridge: Ar
     return found
 
 
-@given(st.integers(0, 999), st.integers(1, 26), st.integers(20, 60))
+@given(st.integers(0, 999), st.integers(1, 26), st.integers(1, 5))
 @settings(max_examples=60)
-def test_fit_solves_the_weighted_least_squares(seed: int, modes: int, markers: int) -> None:
-    rng, base, basis = problem(seed, modes, markers)
-    weight = rng.random(markers) * (rng.random(markers) < 0.7)
-    off, from_start = rng.normal(0.0, 5.0, (markers, 2)), rng.normal(0.0, 5.0, modes)
-    ridge = 10.0 ** rng.uniform(-4.0, 2.0, modes)
-    found = kernels.Modes(base, basis).fit(weight, off, from_start, ridge)
-    np.testing.assert_allclose(found, change(basis, weight, off, from_start, ridge), rtol=1e-9, atol=1e-9)
+def test_markers_are_their_own_points_or_where_the_coefficients_put_them(seed: int, modes: int, step: int) -> None:
+    rng, base, basis = problem(seed, modes, markers=40)
+    coefficients = rng.normal(0.0, 5.0, modes)
+    predicted = (base + coefficients @ basis).reshape(-1, 2)
+    others = np.concatenate([predicted[rng.random(40) < 0.8], rng.uniform(-40.0, 160.0, (15, 2))])
+    others += rng.normal(0.0, 1.5, others.shape)
+    reach, spacing, margin, width, height = 3.0, 9.0, 4.0, 110.0, 90.0
+    partner, square, owns = paired(predicted, others)
+    seen = owns & (square < reach**2)
+    alone = np.delete(others, partner[seen], axis=0)
+    among = np.count_nonzero(paired(alone, predicted)[1] < spacing**2) if len(alone) else 0
+    u, v = predicted.T
+    in_view = (u >= margin) & (u <= width - 1.0 - margin) & (v >= margin) & (v <= height - 1.0 - margin)
+
+    kernel = kernels.Modes(base, basis)
+    found = kernel.find(coefficients, others, np.array([reach, spacing, margin, width, height]))
+    np.testing.assert_array_equal(found.seen, seen)
+    np.testing.assert_allclose(found.positions, np.where(seen[:, None], others[partner], predicted), atol=1e-9)
+    counts = (np.count_nonzero(seen), among, np.count_nonzero(in_view | seen))
+    assert (found.found, found.among, found.expected) == counts
+    assert found.squares == pytest.approx(square[seen].sum(), abs=1e-9)
+    np.testing.assert_allclose(kernel.squares_apart(coefficients, others, step), square[::step], atol=1e-9)
+
+
+def grown(
+    base: Array, basis: Array, coefficients: Array, ridge: Array, others: Array, near: NDArray[np.int64]
+) -> Array:
+    """Reference for ``Modes.grow`` in plain NumPy, from coefficients that are the prior, within 4 px."""
+    predicted = (base + coefficients @ basis).reshape(-1, 2)
+    partner, square, owns = paired(predicted, others)
+    seen = owns & (square < 16.0)
+    off = np.where(seen[:, None], others[partner] - predicted, 0.0)
+    for _ in range(6):
+        count = np.append(seen, False)[near].sum(axis=1)
+        mean = np.concatenate([off, np.zeros((1, 2))])[near].sum(axis=1) / np.maximum(count, 1)[:, None]
+        partner, square, owns = paired(predicted + np.where(seen[:, None], off, 1.2 * mean), others)
+        before = seen.sum()
+        seen = owns & (square < 5.2**2) & (count >= 2)
+        off = np.where(seen[:, None], others[partner] - predicted, 0.0)
+        if seen.sum() <= before:
+            break
+    return coefficients + change(basis, seen.astype(np.float64), off, np.zeros(len(ridge)), ridge)
+
+
+@given(st.integers(0, 999), st.integers(1, 26), st.floats(0.0, 0.4))
+@settings(max_examples=60)
+def test_a_match_grows_as_the_reference(seed: int, modes: int, stretch: float) -> None:
+    rng, base, basis = problem(seed, modes, markers=60)
+    grid = base.reshape(-1, 2)
+    coefficients, ridge = rng.normal(0.0, 1.0, modes), 10.0 ** rng.uniform(-4.0, 2.0, modes)
+    others = grid * [1.0 + stretch, 1.0] + rng.normal(0.0, 0.5, grid.shape)
+    apart = np.linalg.norm(grid[:, None] - grid, axis=2)
+    near = np.argsort(apart, axis=1)[:, 1:8]
+    near = np.where(np.take_along_axis(apart, near, axis=1) < 30.0, near, len(grid))
+    found = kernels.Modes(base, basis).grow(
+        coefficients, coefficients, ridge, others, near, reach_px=4.0, onward=1.2, turns=6
+    )
+    # The moments are in single precision.
+    np.testing.assert_allclose(found, grown(base, basis, coefficients, ridge, others, near), rtol=1e-5, atol=1e-4)
+
+
+def test_a_basis_that_is_not_finite_is_refused() -> None:
+    _, base, basis = problem(0, modes=3, markers=20)
+    basis[1, 2] = np.nan
+    with pytest.raises(ArrayError, match="finite"):
+        kernels.Modes(base, basis)
+
+
+@given(st.integers(1, 3), st.integers(1, 30), st.integers(1, 30))
+@settings(max_examples=50)
+def test_half_layers_are_products_of_rounded_weights_on_any_processor(networks: int, inputs: int, outputs: int) -> None:
+    rng = np.random.default_rng(31 * inputs + outputs)
+    weight, bias, x = (
+        rng.normal(size=n).astype(np.float32)
+        for n in ((networks, inputs, outputs), (networks, outputs), (networks, inputs))
+    )
+    layers = kernels.HalfLayers(weight, bias)(x)
+    rounded = weight.astype(np.float16).astype(np.float64)
+    np.testing.assert_allclose(layers, np.einsum("ni,nij->nj", x, rounded) + bias, rtol=1e-4, atol=1e-4)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(kernels, "_FOUND", SimpleNamespace(reads_halves=lambda: False, affine=_kernelsc.affine))
+        np.testing.assert_array_equal(kernels.HalfLayers(weight, bias)(x), layers)
 
 
 def settled(
@@ -260,6 +337,7 @@ def test_distances_of_bytes_are_whole(count: int, length: int, seed: int) -> Non
     np.testing.assert_array_equal(kernels.bytes_apart(np.ascontiguousarray(rows[1:]), rows[0]), expected)
 
 
+BASIS = np.ones((6, 8)), np.ones((6, 8), np.float32)
 GOOD: dict[Callable[..., object], tuple[object, ...]] = {
     _kernelsc.median_5: (np.zeros((4, 5), np.uint8), np.zeros((4, 5), np.uint8)),
     _kernelsc.threshold: (np.zeros((4, 5), np.uint8), True, 3, 0.0, np.zeros((4, 5), np.uint8)),
@@ -267,15 +345,26 @@ GOOD: dict[Callable[..., object], tuple[object, ...]] = {
     _kernelsc.area_means: (np.zeros((8, 12), np.uint8), np.zeros((3, 5), np.uint8)),
     _kernelsc.discs: (np.zeros((4, 5), np.uint8), 1, 9, 9),
     _kernelsc.pair: (np.zeros((3, 2)), np.zeros((4, 2)), np.zeros(3, np.int64), np.zeros(3), np.zeros(3, bool)),
-    _kernelsc.fit: (np.ones((6, 8)), np.ones(3), np.zeros((3, 2)), np.zeros(2), np.ones(2), np.zeros(2)),
+    _kernelsc.grow: (
+        *(*BASIS, np.ones(6), np.zeros(2), np.zeros(2), np.ones(2), np.zeros((4, 2))),
+        *(np.full((3, 2), 3), 5.0, 1.2, 6, np.zeros(2)),
+    ),
+    _kernelsc.squares_apart: (*BASIS, np.ones(6), np.zeros(2), np.zeros((4, 2)), 1, np.zeros(3)),
+    _kernelsc.find_markers: (
+        *(*BASIS, np.ones(6), np.zeros(2), np.zeros((4, 2)), np.ones(5)),
+        *(np.zeros((3, 2)), np.zeros(3, bool)),
+    ),
     _kernelsc.settle: (
-        *(np.ones((6, 8)), np.ones(6), np.zeros(2), np.ones(2), np.zeros((4, 2))),
+        *(*BASIS, np.ones(6), np.zeros(2), np.ones(2), np.zeros((4, 2))),
         *(5.0, 2.0, 0.1, 12, np.zeros(2)),
     ),
     _kernelsc.density: (np.zeros((2, 3, 2)), np.zeros((2, 3)), np.zeros(2), 4.0, np.zeros((2, 5, 5))),
     _kernelsc.bytes_apart: (np.zeros((3, 5), np.uint8), np.zeros(5, np.uint8), np.zeros(3, np.int32)),
     _kernelsc.affine: (*(np.zeros(shape, np.float32) for shape in ((2, 3), 3, 2)), np.zeros(3, np.float32)),
 }
+if _kernelsc.reads_halves():
+    halves = np.zeros((2, 1, 1, 64), np.float16), *(np.zeros(shape, np.float32) for shape in ((2, 8), (2, 5), (2, 8)))
+    GOOD[_kernelsc.affine_of_halves] = halves
 SHAPES = st.sampled_from([(), (0,), (1,), (2,), (3,), (6,), (2, 3), (4, 5), (6, 8), (0, 2), (3, 0), (4, 2), (2, 3, 2)])
 TYPES = st.sampled_from([np.uint8, np.int64, np.float32, np.float64, np.bool_, np.complex128])
 
@@ -306,8 +395,10 @@ def test_other_arrays_are_refused_or_computed(kernel: Callable[..., object], dat
     ("kernel", "at"),
     [
         *((kernel, at) for kernel, at in [(_kernelsc.pair, 0), (_kernelsc.pair, 1)]),
-        *((_kernelsc.fit, at) for at in range(5)),
-        *((_kernelsc.settle, at) for at in range(5)),
+        *((_kernelsc.grow, at) for at in range(2, 7)),
+        *((_kernelsc.squares_apart, at) for at in range(2, 5)),
+        *((_kernelsc.find_markers, at) for at in range(2, 6)),
+        *((_kernelsc.settle, at) for at in range(2, 6)),
         *((_kernelsc.density, at) for at in range(3)),
     ],
 )
@@ -322,7 +413,7 @@ def test_non_finite_arguments_are_refused_by_name(kernel: Callable[..., object],
 
 
 def test_non_contiguous_arrays_are_refused() -> None:
-    for kernel, at in [(_kernelsc.pair, 0), (_kernelsc.fit, 0), (_kernelsc.affine, 0)]:
+    for kernel, at in [(_kernelsc.pair, 0), (_kernelsc.settle, 0), (_kernelsc.affine, 0)]:
         arguments = list(GOOD[kernel])
         arguments[at] = np.asfortranarray(np.ones((6, 8)))[::2, ::2]
         with pytest.raises(ArrayError, match="order"):

@@ -11,6 +11,13 @@
 #include <stdlib.h>
 #include <string.h>
 
+#if defined(__x86_64__) && defined(__GNUC__)
+#include <immintrin.h>
+#define INTEL 1
+#else
+#define INTEL 0
+#endif
+
 /* Two versions of a function where the processor is asked at load time which one it can run. */
 #if defined(__x86_64__) && defined(__GLIBC__) && defined(__GNUC__) && !defined(__clang__)
 #define WIDE_VECTORS __attribute__((target_clones("avx2", "default")))
@@ -180,27 +187,58 @@ WIDE_VECTORS static void roll_columns(uint16_t *restrict sums, const uint8_t *in
         sums[x] = (uint16_t)(sums[x] + in[x] - out[x]);
 }
 
-/* before[i]: the sum of the first i numbers. */
-static void add_up(const uint16_t *restrict numbers, ptrdiff_t count, uint32_t *restrict before)
+/* What a neighbourhood's sum is compared with: white where sum + half < area * (pixel + offset). */
+typedef struct {
+    int32_t area, half, offset;
+} Comparison;
+
+/* White where a pixel exceeds the rounded mean of its neighbourhood less the offset, in whole numbers throughout.
+ * `sum` is that of the first pixel's neighbourhood, to whose left `from` pixels are done already; each next one loses
+ * columns[x] and takes in columns[x + block]. */
+static void above_mean(const uint8_t *pixels, const uint16_t *columns, ptrdiff_t block, int32_t sum, Comparison with,
+                       ptrdiff_t from, ptrdiff_t width, uint8_t *restrict to)
 {
-    uint32_t total = 0;
-    for (ptrdiff_t i = 0; i < count; i++) {
-        before[i] = total;
-        total += numbers[i];
+    for (ptrdiff_t x = from; x < width; x++) {
+        to[x] = sum + with.half < with.area * ((int32_t)pixels[x] + with.offset) ? 255 : 0;
+        sum += (int32_t)columns[x + block] - columns[x];
     }
-    before[count] = total;
 }
 
-/* White where a pixel exceeds the rounded mean of its neighbourhood less the offset, in whole numbers throughout. */
-WIDE_VECTORS static void above_mean(const uint8_t *pixels, const uint32_t *before, ptrdiff_t block, int32_t offset,
-                                    ptrdiff_t width, uint8_t *restrict to)
+#if INTEL
+/* The first whole 32 of `width` pixels, as `above_mean`; `sum` becomes that of the next neighbourhood. How many. */
+__attribute__((target("avx2"))) static ptrdiff_t above_mean_by_32(const uint8_t *pixels, const uint16_t *columns,
+                                                                 ptrdiff_t block, int32_t *sum, Comparison with,
+                                                                 ptrdiff_t width, uint8_t *restrict to)
 {
-    int32_t area = (int32_t)(block * block), half = (area - 1) / 2;
-    for (ptrdiff_t x = 0; x < width; x++) {
-        int32_t sum = (int32_t)(before[x + block] - before[x]);
-        to[x] = sum + half < area * ((int32_t)pixels[x] + offset) ? 255 : 0;
+    const __m256i area = _mm256_set1_epi32(with.area), half = _mm256_set1_epi32(with.half);
+    const __m256i offset = _mm256_set1_epi32(with.offset), last = _mm256_set1_epi32(7), fourth = _mm256_set1_epi32(3);
+    const __m256i upper = _mm256_setr_epi32(0, 0, 0, 0, -1, -1, -1, -1), order = _mm256_setr_epi32(0, 4, 1, 5, 2, 6, 3, 7);
+    __m256i before = _mm256_set1_epi32(*sum);
+    ptrdiff_t x = 0;
+    for (; x + 32 <= width; x += 32) {
+        __m256i white[4];
+        for (int k = 0; k < 4; k++) {
+            ptrdiff_t at = x + 8 * k;
+            __m256i out = _mm256_cvtepu16_epi32(_mm_loadu_si128((const __m128i *)(columns + at)));
+            __m256i in = _mm256_cvtepu16_epi32(_mm_loadu_si128((const __m128i *)(columns + at + block)));
+            __m256i change = _mm256_sub_epi32(in, out);
+            /* What the sums have changed by behind each pixel: within four, then the first four's on the last. */
+            __m256i changed = _mm256_add_epi32(change, _mm256_slli_si256(change, 4));
+            changed = _mm256_add_epi32(changed, _mm256_slli_si256(changed, 8));
+            changed = _mm256_add_epi32(changed, _mm256_and_si256(_mm256_permutevar8x32_epi32(changed, fourth), upper));
+            __m256i sums = _mm256_add_epi32(before, _mm256_sub_epi32(changed, change));
+            before = _mm256_add_epi32(before, _mm256_permutevar8x32_epi32(changed, last));
+            __m256i pixel = _mm256_cvtepu8_epi32(_mm_loadl_epi64((const __m128i *)(pixels + at)));
+            __m256i most = _mm256_mullo_epi32(_mm256_add_epi32(pixel, offset), area);
+            white[k] = _mm256_cmpgt_epi32(most, _mm256_add_epi32(sums, half));
+        }
+        __m256i packed = _mm256_packs_epi16(_mm256_packs_epi32(white[0], white[1]), _mm256_packs_epi32(white[2], white[3]));
+        _mm256_storeu_si256((__m256i *)(to + x), _mm256_permutevar8x32_epi32(packed, order));
     }
+    *sum = _mm256_cvtsi256_si32(before);
+    return x;
 }
+#endif
 
 /* Adaptive threshold of an image or of its medians; the border is repeated outwards. 0: out of memory.
  *
@@ -212,9 +250,13 @@ static int threshold(const uint8_t *image, ptrdiff_t row_bytes, ptrdiff_t height
 {
     Rows rows;
     ptrdiff_t half = block / 2, padded = width + block - 1;
-    uint16_t *columns = calloc((size_t)padded, sizeof *columns);
-    uint32_t *before = malloc((size_t)(padded + 1) * sizeof *before);
-    int done = columns && before && open_rows(&rows, image, row_bytes, height, width, with_median, block + 1);
+    /* One more column than the neighbourhoods reach: the last pixel's sum is rolled on, too. */
+    uint16_t *columns = calloc((size_t)padded + 1, sizeof *columns);
+    Comparison with = {.area = (int32_t)(block * block), .half = ((int32_t)(block * block) - 1) / 2, .offset = offset};
+    int done = columns && open_rows(&rows, image, row_bytes, height, width, with_median, block + 1);
+#if INTEL
+    int wide = __builtin_cpu_supports("avx2");
+#endif
     if (done) {
         uint16_t *middle = columns + half;
         for (ptrdiff_t y = -half - 1; y < half; y++) {
@@ -223,18 +265,25 @@ static int threshold(const uint8_t *image, ptrdiff_t row_bytes, ptrdiff_t height
                 middle[x] = (uint16_t)(middle[x] + row[x]);
         }
         for (ptrdiff_t y = 0; y < height; y++) {
-            const uint8_t *in = row_at(&rows, y + half);
+            const uint8_t *in = row_at(&rows, y + half), *pixels;
             roll_columns(middle, in, row_at(&rows, y - half - 1), width);
             for (ptrdiff_t x = 0; x < half; x++) {
                 columns[x] = middle[0];
                 middle[width + x] = middle[width - 1];
             }
-            add_up(columns, padded, before);
-            above_mean(row_at(&rows, y), before, block, offset, width, to + y * width);
+            int32_t sum = 0;
+            for (ptrdiff_t x = 0; x < block; x++)
+                sum += columns[x];
+            ptrdiff_t from = 0;
+            pixels = row_at(&rows, y);
+#if INTEL
+            if (wide)
+                from = above_mean_by_32(pixels, columns, block, &sum, with, width, to + y * width);
+#endif
+            above_mean(pixels, columns, block, sum, with, from, width, to + y * width);
         }
         close_rows(&rows);
     }
-    free(before);
     free(columns);
     return done;
 }
@@ -418,15 +467,27 @@ static int32_t join(Component *components, int32_t a, int32_t b)
     return first;
 }
 
-/* One bit for each of eight pixels, the first the lowest: whether it is white. */
+/* One bit for each of 64 pixels, the first the lowest: whether it is white. */
 static inline uint64_t white_bits(const uint8_t *pixels)
 {
-    uint64_t eight = 0, low = 0x7f7f7f7f7f7f7f7fu;
-    for (int i = 0; i < 8; i++)
-        eight |= (uint64_t)pixels[i] << (8 * i);
-    /* The highest bit of each byte, then all of them side by side. */
-    eight = (((eight & low) + low) | eight) >> 7 & 0x0101010101010101u;
-    return eight * 0x0102040810204080u >> 56;
+    uint64_t white = 0;
+#if INTEL
+    for (int i = 0; i < 64; i += 16) {
+        __m128i sixteen = _mm_loadu_si128((const __m128i *)(pixels + i));
+        uint64_t black = (uint64_t)_mm_movemask_epi8(_mm_cmpeq_epi8(sixteen, _mm_setzero_si128()));
+        white |= (black ^ 0xffff) << i;
+    }
+#else
+    for (int i = 0; i < 64; i += 8) {
+        uint64_t eight = 0, low = 0x7f7f7f7f7f7f7f7fu;
+        for (int j = 0; j < 8; j++)
+            eight |= (uint64_t)pixels[i + j] << (8 * j);
+        /* The highest bit of each byte, then all of them side by side. */
+        eight = (((eight & low) + low) | eight) >> 7 & 0x0101010101010101u;
+        white |= (eight * 0x0102040810204080u >> 56) << i;
+    }
+#endif
+    return white;
 }
 
 /* Runs of one row. Where white begins or ends is read from 64 pixels at once, which are mostly black. */
@@ -435,12 +496,11 @@ static int32_t runs_of(const uint8_t *row, int32_t width, Run *runs)
     int32_t edges = 0;
     uint64_t last = 0;
     for (int32_t x = 0; x < width; x += 64) {
-        uint64_t white = 0;
-        int32_t here = width - x < 64 ? width - x : 64, i = 0;
-        for (; i + 8 <= here; i += 8)
-            white |= white_bits(row + x + i) << i;
-        for (; i < here; i++)
-            white |= (uint64_t)(row[x + i] != 0) << i;
+        uint8_t rest[64] = {0};
+        const uint8_t *pixels = row + x;
+        if (width - x < 64)
+            pixels = memcpy(rest, row + x, (size_t)(width - x));
+        uint64_t white = white_bits(pixels);
         for (uint64_t edge = white ^ (white << 1 | last); edge; edge &= edge - 1, edges++) {
             int32_t at = x + lowest_bit(edge);
             if (edges % 2)

@@ -10,7 +10,8 @@
 #include "_image_kernels.h"
 #include "_matching_kernels.h"
 
-enum { MOST_ARGUMENTS = 12, ANY = -1 };
+/* TRUSTED: numbers that kernels.py has checked once are not checked again at each call. */
+enum { MOST_ARGUMENTS = 12, ANY = -1, TRUSTED = 1 << 30 };
 
 static const double LARGEST = 1e9;
 static const Py_ssize_t MOST = 1 << 24;
@@ -51,7 +52,7 @@ static int is_of(const Py_buffer *view, char type)
 static Py_buffer *take(Call *call, const char *argument, PyObject *value, char type, int flags, int ndim, ...)
 {
     Py_buffer *view = &call->views[call->count];
-    if (PyObject_GetBuffer(value, view, flags | PyBUF_FORMAT) < 0) {
+    if (PyObject_GetBuffer(value, view, (flags & ~TRUSTED) | PyBUF_FORMAT) < 0) {
         PyErr_Clear();
         refuse(call, argument, "is no array of the right order in memory");
         return NULL;
@@ -73,7 +74,7 @@ static Py_buffer *take(Call *call, const char *argument, PyObject *value, char t
         refuse(call, argument, "has another shape");
         return NULL;
     }
-    if (type == 'd' && !(flags & PyBUF_WRITABLE)) {
+    if (type == 'd' && !(flags & (PyBUF_WRITABLE | TRUSTED))) {
         const double *numbers = view->buf;
         for (Py_ssize_t i = 0; i < view->len / 8; i++)
             if (!(fabs(numbers[i]) <= LARGEST)) {
@@ -266,7 +267,7 @@ static PyObject *py_pair(PyObject *module, PyObject *const *arguments, Py_ssize_
     if (done) {
         const double *place = places->buf;
         for (Py_ssize_t i = 0; i < places->shape[0]; i++)
-            ((int64_t *)partner->buf)[i] = nearest_point(&buckets, place + 2 * i, (double *)square->buf + i);
+            ((int64_t *)partner->buf)[i] = nearest_point(&buckets, place + 2 * i, INFINITY, (double *)square->buf + i);
         find_owners(partner->buf, square->buf, places->shape[0], owner, points->shape[0], owns->buf);
         free_buckets(&buckets);
     }
@@ -417,47 +418,65 @@ static PyObject *py_measure_field(PyObject *module, PyObject *const *arguments, 
     return ended(&call, done);
 }
 
-/* The basis as (2 markers, stride), of which the first columns are the modes. */
-static int take_modes(Call *call, PyObject *value, Py_ssize_t modes, Modes *to)
+/* The basis as (2 markers, stride), of which the first columns are the modes, in double and in single precision. */
+static int take_modes(Call *call, PyObject *value, PyObject *rough, Py_ssize_t modes, Modes *to)
 {
-    Py_buffer *basis = take(call, "basis", value, 'd', PyBUF_C_CONTIGUOUS, 2, (Py_ssize_t)ANY, (Py_ssize_t)ANY);
+    Py_buffer *basis = take(call, "basis", value, 'd', PyBUF_C_CONTIGUOUS | TRUSTED, 2, (Py_ssize_t)ANY, (Py_ssize_t)ANY);
     if (!basis)
         return 0;
     Py_ssize_t stride = basis->shape[1];
-    if (basis->shape[0] < 2 || basis->shape[0] % 2 || stride < 1 || stride > 1024 || stride % TILE_COLUMNS ||
-        modes < 1 || modes > stride) {
+    if (basis->shape[0] < 2 || basis->shape[0] % 2 || stride < 1 || stride > 1024 || stride % TILE || modes < 1 ||
+        modes > stride) {
         refuse(call, "basis", "has another shape");
         return 0;
     }
-    *to = (Modes){basis->buf, basis->shape[0] / 2, modes, stride};
+    const float *single = in_rows_of(call, "rough", rough, basis->shape[0], stride);
+    if (!single)
+        return 0;
+    *to = (Modes){basis->buf, single, basis->shape[0] / 2, modes, stride};
     return 1;
 }
 
-static PyObject *py_fit(PyObject *module, PyObject *const *arguments, Py_ssize_t count)
+static PyObject *py_grow(PyObject *module, PyObject *const *arguments, Py_ssize_t count)
 {
-    Call call = {.function = "fit"};
+    Call call = {.function = "grow"};
     Modes modes;
-    Py_buffer *weight, *off, *from_start, *ridge, *change;
-    if (!takes(&call, count, 6) ||
-        !(ridge = take(&call, "ridge", arguments[4], 'd', PyBUF_C_CONTIGUOUS, 1, (Py_ssize_t)ANY)) ||
-        !take_modes(&call, arguments[0], ridge->shape[0], &modes) ||
-        !(weight = take(&call, "weight", arguments[1], 'd', PyBUF_C_CONTIGUOUS, 1, (Py_ssize_t)modes.markers)) ||
-        !(off = take(&call, "off", arguments[2], 'd', PyBUF_C_CONTIGUOUS, 2, (Py_ssize_t)modes.markers, (Py_ssize_t)2)) ||
-        !(from_start = take(&call, "from_start", arguments[3], 'd', PyBUF_C_CONTIGUOUS, 1, ridge->shape[0])) ||
-        !(change = take(&call, "change", arguments[5], 'd', PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE, 1, ridge->shape[0])))
+    Py_buffer *base, *coefficients, *start, *ridge, *points, *neighbours, *change;
+    Growth growth;
+    double turns;
+    if (!takes(&call, count, 12) ||
+        !(ridge = take(&call, "ridge", arguments[5], 'd', PyBUF_C_CONTIGUOUS, 1, (Py_ssize_t)ANY)) ||
+        !take_modes(&call, arguments[0], arguments[1], ridge->shape[0], &modes) ||
+        !(base = take(&call, "base", arguments[2], 'd', PyBUF_C_CONTIGUOUS, 1, (Py_ssize_t)(2 * modes.markers))) ||
+        !(coefficients = take(&call, "coefficients", arguments[3], 'd', PyBUF_C_CONTIGUOUS, 1, ridge->shape[0])) ||
+        !(start = take(&call, "start", arguments[4], 'd', PyBUF_C_CONTIGUOUS, 1, ridge->shape[0])) ||
+        !(points = take_points(&call, "points", arguments[6])) ||
+        !(neighbours = take(&call, "neighbours", arguments[7], 'q', PyBUF_C_CONTIGUOUS, 2, (Py_ssize_t)modes.markers,
+                            (Py_ssize_t)ANY)) ||
+        !number(&call, "reach_px", arguments[8], 1e-9, LARGEST, &growth.reach_px) ||
+        !number(&call, "onward", arguments[9], 0.0, 1000.0, &growth.onward) ||
+        !number(&call, "turns", arguments[10], 0.0, 1000.0, &turns) ||
+        !(change = take(&call, "change", arguments[11], 'd', PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE, 1, ridge->shape[0])))
         return finish(&call, NULL);
-    double *room = malloc((size_t)(modes.stride * (modes.stride + 1)) * sizeof *room);
-    if (!room)
-        return ended(&call, 0);
-    double *found = room + modes.stride * modes.stride;
-    if (!fit_change(&modes, weight->buf, off->buf, from_start->buf, ridge->buf, room, found)) {
-        free(room);
+    growth.turns = (int)turns;
+    const int64_t *other = neighbours->buf;
+    for (Py_ssize_t i = 0; i < modes.markers * neighbours->shape[1]; i++)
+        if (other[i] < 0 || other[i] > modes.markers) {
+            refuse(&call, "neighbours", "are out of range");
+            return finish(&call, NULL);
+        }
+    Buckets buckets;
+    int done = fill_buckets(&buckets, points->buf, points->shape[0]);
+    if (done) {
+        done = grow(&modes, base->buf, coefficients->buf, start->buf, ridge->buf, &buckets, points->shape[0], other,
+                    neighbours->shape[1], growth, change->buf);
+        free_buckets(&buckets);
+    }
+    if (done < 0) {
         refuse(&call, "ridge", "leaves moments that are not positive definite");
         return finish(&call, NULL);
     }
-    memcpy(change->buf, found, (size_t)modes.modes * sizeof *found);
-    free(room);
-    return ended(&call, 1);
+    return ended(&call, done);
 }
 
 static PyObject *py_settle(PyObject *module, PyObject *const *arguments, Py_ssize_t count)
@@ -467,17 +486,17 @@ static PyObject *py_settle(PyObject *module, PyObject *const *arguments, Py_ssiz
     Py_buffer *base, *start, *ridge, *points, *coefficients;
     Settling settling;
     double turns;
-    if (!takes(&call, count, 10) ||
-        !(ridge = take(&call, "ridge", arguments[3], 'd', PyBUF_C_CONTIGUOUS, 1, (Py_ssize_t)ANY)) ||
-        !take_modes(&call, arguments[0], ridge->shape[0], &modes) ||
-        !(base = take(&call, "base", arguments[1], 'd', PyBUF_C_CONTIGUOUS, 1, (Py_ssize_t)(2 * modes.markers))) ||
-        !(start = take(&call, "start", arguments[2], 'd', PyBUF_C_CONTIGUOUS, 1, ridge->shape[0])) ||
-        !(points = take_points(&call, "points", arguments[4])) ||
-        !number(&call, "reach_px", arguments[5], 1e-9, LARGEST, &settling.reach_px) ||
-        !number(&call, "least_reach_px", arguments[6], 1e-9, LARGEST, &settling.least_reach_px) ||
-        !number(&call, "settled_px", arguments[7], 0.0, LARGEST, &settling.settled_px) ||
-        !number(&call, "turns", arguments[8], 0.0, 1000.0, &turns) ||
-        !(coefficients = take(&call, "coefficients", arguments[9], 'd', PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE, 1,
+    if (!takes(&call, count, 11) ||
+        !(ridge = take(&call, "ridge", arguments[4], 'd', PyBUF_C_CONTIGUOUS, 1, (Py_ssize_t)ANY)) ||
+        !take_modes(&call, arguments[0], arguments[1], ridge->shape[0], &modes) ||
+        !(base = take(&call, "base", arguments[2], 'd', PyBUF_C_CONTIGUOUS, 1, (Py_ssize_t)(2 * modes.markers))) ||
+        !(start = take(&call, "start", arguments[3], 'd', PyBUF_C_CONTIGUOUS, 1, ridge->shape[0])) ||
+        !(points = take_points(&call, "points", arguments[5])) ||
+        !number(&call, "reach_px", arguments[6], 1e-9, LARGEST, &settling.reach_px) ||
+        !number(&call, "least_reach_px", arguments[7], 1e-9, LARGEST, &settling.least_reach_px) ||
+        !number(&call, "settled_px", arguments[8], 0.0, LARGEST, &settling.settled_px) ||
+        !number(&call, "turns", arguments[9], 0.0, 1000.0, &turns) ||
+        !(coefficients = take(&call, "coefficients", arguments[10], 'd', PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE, 1,
                               ridge->shape[0])))
         return finish(&call, NULL);
     settling.turns = (int)turns;
@@ -489,6 +508,62 @@ static PyObject *py_settle(PyObject *module, PyObject *const *arguments, Py_ssiz
         free_buckets(&buckets);
     }
     return ended(&call, done);
+}
+
+/* Of each `step` of the markers, as there are `squares`. */
+static PyObject *py_squares_apart(PyObject *module, PyObject *const *arguments, Py_ssize_t count)
+{
+    Call call = {.function = "squares_apart"};
+    Modes modes;
+    Py_buffer *base, *coefficients, *points, *squares;
+    double step;
+    if (!takes(&call, count, 7) ||
+        !(coefficients = take(&call, "coefficients", arguments[3], 'd', PyBUF_C_CONTIGUOUS, 1, (Py_ssize_t)ANY)) ||
+        !take_modes(&call, arguments[0], arguments[1], coefficients->shape[0], &modes) ||
+        !(base = take(&call, "base", arguments[2], 'd', PyBUF_C_CONTIGUOUS, 1, (Py_ssize_t)(2 * modes.markers))) ||
+        !(points = take_points(&call, "points", arguments[4])) ||
+        !number(&call, "step", arguments[5], 1.0, 1000.0, &step) ||
+        !(squares = take(&call, "squares", arguments[6], 'd', PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE, 1,
+                         (modes.markers - 1) / (Py_ssize_t)step + 1)))
+        return finish(&call, NULL);
+    Buckets buckets;
+    int done = fill_buckets(&buckets, points->buf, points->shape[0]);
+    if (done) {
+        squares_apart(&modes, base->buf, coefficients->buf, (ptrdiff_t)step, &buckets, squares->buf);
+        free_buckets(&buckets);
+    }
+    return ended(&call, done);
+}
+
+static PyObject *py_find_markers(PyObject *module, PyObject *const *arguments, Py_ssize_t count)
+{
+    Call call = {.function = "find_markers"};
+    Modes modes;
+    Py_buffer *base, *coefficients, *points, *view, *positions, *seen;
+    if (!takes(&call, count, 8) ||
+        !(coefficients = take(&call, "coefficients", arguments[3], 'd', PyBUF_C_CONTIGUOUS, 1, (Py_ssize_t)ANY)) ||
+        !take_modes(&call, arguments[0], arguments[1], coefficients->shape[0], &modes) ||
+        !(base = take(&call, "base", arguments[2], 'd', PyBUF_C_CONTIGUOUS, 1, (Py_ssize_t)(2 * modes.markers))) ||
+        !(points = take_points(&call, "points", arguments[4])) ||
+        !(view = take(&call, "view", arguments[5], 'd', PyBUF_C_CONTIGUOUS, 1, (Py_ssize_t)5)) ||
+        !(positions = take(&call, "positions", arguments[6], 'd', PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE, 2,
+                           (Py_ssize_t)modes.markers, (Py_ssize_t)2)) ||
+        !(seen = take(&call, "seen", arguments[7], '?', PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE, 1,
+                      (Py_ssize_t)modes.markers)))
+        return finish(&call, NULL);
+    const double *limit = view->buf;
+    Buckets buckets;
+    Tally tally;
+    int done = fill_buckets(&buckets, points->buf, points->shape[0]);
+    if (done) {
+        done = find_markers(&modes, base->buf, coefficients->buf, &buckets, points->shape[0],
+                            (View){limit[0], limit[1], limit[2], limit[3], limit[4]}, positions->buf, seen->buf, &tally);
+        free_buckets(&buckets);
+    }
+    if (!done)
+        return ended(&call, 0);
+    return finish(&call, Py_BuildValue("nnnd", (Py_ssize_t)tally.found, (Py_ssize_t)tally.among,
+                                       (Py_ssize_t)tally.expected, tally.squares));
 }
 
 static PyObject *py_density(PyObject *module, PyObject *const *arguments, Py_ssize_t count)
@@ -531,6 +606,35 @@ static PyObject *py_affine(PyObject *module, PyObject *const *arguments, Py_ssiz
     return ended(&call, 1);
 }
 
+static PyObject *py_reads_halves(PyObject *module, PyObject *const *arguments, Py_ssize_t count)
+{
+    return PyBool_FromLong(reads_halves());
+}
+
+/* Layers of the same size, each with its own input. */
+static PyObject *py_affine_of_halves(PyObject *module, PyObject *const *arguments, Py_ssize_t count)
+{
+    Call call = {.function = "affine_of_halves"};
+    Py_buffer *weight, *bias, *x, *to;
+    if (!takes(&call, count, 4) ||
+        !(bias = take(&call, "bias", arguments[1], 'f', PyBUF_C_CONTIGUOUS, 2, (Py_ssize_t)ANY, (Py_ssize_t)ANY)) ||
+        !(x = take(&call, "x", arguments[2], 'f', PyBUF_C_CONTIGUOUS, 2, bias->shape[0], (Py_ssize_t)ANY)) ||
+        !(weight = take(&call, "weight", arguments[0], 'e', PyBUF_C_CONTIGUOUS, 4, bias->shape[0],
+                        (x->shape[1] + 7) / 8, bias->shape[1] / 8, (Py_ssize_t)64)) ||
+        !(to = take(&call, "to", arguments[3], 'f', PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE, 2, bias->shape[0],
+                    bias->shape[1])))
+        return finish(&call, NULL);
+    Py_ssize_t layers = bias->shape[0], outputs = bias->shape[1], inputs = x->shape[1];
+    if (outputs % 8 || !reads_halves()) {
+        refuse(&call, "bias", "is no multiple of eight, or the processor does not read half precision");
+        return finish(&call, NULL);
+    }
+    for (Py_ssize_t i = 0; i < layers; i++)
+        affine_of_halves((const uint16_t *)weight->buf + i * (weight->len / 2 / layers), (const float *)bias->buf + i * outputs,
+                         (const float *)x->buf + i * inputs, inputs, outputs, (float *)to->buf + i * outputs);
+    return ended(&call, 1);
+}
+
 static PyObject *py_bytes_apart(PyObject *module, PyObject *const *arguments, Py_ssize_t count)
 {
     Call call = {.function = "bytes_apart"};
@@ -550,8 +654,8 @@ static PyObject *py_bytes_apart(PyObject *module, PyObject *const *arguments, Py
 
 #define FAST(name) {#name, (PyCFunction)(void (*)(void))py_##name, METH_FASTCALL, NULL}
 
-static PyMethodDef METHODS[] = {FAST(median_5), FAST(threshold), FAST(shrink),  FAST(area_means),  FAST(discs),  FAST(pair), FAST(fit),
-                                FAST(settle),   FAST(density),   FAST(bytes_apart), FAST(affine), FAST(mean_shift), FAST(follow), FAST(first_block), FAST(block_changes), FAST(measure_field), {NULL, NULL, 0, NULL}};
+static PyMethodDef METHODS[] = {FAST(median_5), FAST(threshold), FAST(shrink),  FAST(area_means),  FAST(discs),  FAST(pair), FAST(grow),
+                                FAST(settle), FAST(squares_apart), FAST(find_markers), FAST(density),   FAST(bytes_apart), FAST(affine), FAST(reads_halves), FAST(affine_of_halves), FAST(mean_shift), FAST(follow), FAST(first_block), FAST(block_changes), FAST(measure_field), {NULL, NULL, 0, NULL}};
 
 static struct PyModuleDef MODULE = {PyModuleDef_HEAD_INIT, "touchcell.perception._kernelsc",
                                     "Compiled kernels of touchcell.perception.kernels.", -1, METHODS};

@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 
 from touchcell.compiled import extension
 from touchcell.geometry.types import Array, ImageArray
-from touchcell.perception.errors import KernelsMissing
+from touchcell.perception.errors import ArrayError, KernelsMissing
 
-_COLUMNS = 8
+_TILE = 8
 _MOST_OFFSET = 256.0
+_MOST_BASIS = 1.0 + 1e-6
 _SETTLED_PX = 0.05
 _FACTORS = (4, 8, 16, 32, 64)
 
@@ -309,33 +310,115 @@ def pair(places: Array, points: Array) -> tuple[NDArray[np.int64], Array, NDArra
     return partner, square, owns
 
 
+class Sighting(NamedTuple):
+    """Markers beside the points of an image.
+
+    Attributes:
+        positions: (m, 2) px, each marker's own point, or where the coefficients put it.
+        seen: (m,) whether it has a point of its own.
+        found: how many have one.
+        among: points that are no marker's own although a marker is near.
+        expected: markers that are seen or should be in view.
+        squares: sum of squared distances of the seen ones from their points, px^2.
+    """
+
+    positions: Array
+    seen: NDArray[np.bool_]
+    found: int
+    among: int
+    expected: int
+    squares: float
+
+
 class Modes:
-    """Displacement modes of the markers, laid out for ``settle`` and ``fit``.
+    """Displacement modes of the markers, laid out for the searches and fits of a matcher.
 
     Args:
         base: (2 m,) px, markers (u, v, u, v, ...) with all coefficients zero.
-        basis: (k, 2 m), one row per mode.
+        basis: (k, 2 m), one orthonormal row per mode.
     """
 
     def __init__(self, base: Array, basis: Array) -> None:
+        if not (np.abs(basis) <= _MOST_BASIS).all():
+            raise ArrayError("Modes", "basis", "is not finite, or larger than 1")
         modes, coordinates = basis.shape
         self._base = np.ascontiguousarray(base)
         self._modes = modes
-        self._basis = np.zeros((coordinates, -(-modes // _COLUMNS) * _COLUMNS))
+        self._basis = np.zeros((coordinates, -(-modes // _TILE) * _TILE))
         self._basis[:, :modes] = basis.T
+        self._rough = self._basis.astype(np.float32)
 
-    def fit(self, weight: Array, off: Array, from_start: Array, ridge: Array) -> Array:
-        """Return the (k,) change d of the coefficients that solves (B' W B + R) d = B' W off + R from_start.
+    def squares_apart(self, coefficients: Array, points: Array, step: int) -> Array:
+        """Return px^2, squared distances of each ``step`` of the markers from the nearest point.
 
         Args:
-            weight: (m,) of the markers.
-            off: (m, 2) px, desired displacement of each marker.
-            from_start: (k,) px, difference back to the prior coefficients.
-            ridge: (k,) diagonal of R.
+            coefficients: (k,) px.
+            points: (n, 2) px, one or more.
+            step: 1 for all markers.
+        """
+        squares = np.empty((len(self._base) // 2 - 1) // step + 1)
+        _compiled().squares_apart(
+            self._basis, self._rough, self._base, coefficients, np.ascontiguousarray(points), step, squares
+        )
+        return squares
+
+    def find(self, coefficients: Array, points: Array, view: Array) -> Sighting:
+        """Return the markers of (k,) coefficients beside points (n, 2) px.
+
+        Args:
+            coefficients: (k,) px.
+            points: (n, 2) px, one or more.
+            view: (5,) px: a marker's own point is within the first; points within the second of a marker count as
+                ``among``; a marker is in view if it lies the third inside an image of the fourth's width, the
+                fifth's height.
+        """
+        m = len(self._base) // 2
+        positions, seen = np.empty((m, 2)), np.empty(m, np.bool_)
+        counts = _compiled().find_markers(
+            self._basis, self._rough, self._base, coefficients, np.ascontiguousarray(points), view, positions, seen
+        )
+        return Sighting(positions, seen, *counts)
+
+    def grow(
+        self,
+        coefficients: Array,
+        start: Array,
+        ridge: Array,
+        points: Array,
+        neighbours: NDArray[np.int64],
+        *,
+        reach_px: float,
+        onward: float,
+        turns: int,
+    ) -> Array:
+        """Return the (k,) coefficients after markers without a point were searched for where their neighbours are.
+
+        Args:
+            coefficients: (k,) px, initial value.
+            start: (k,) px, prior.
+            ridge: (k,) weight of the prior.
+            points: (n, 2) px.
+            neighbours: (m, j) numbers of each marker's neighbours; m for none.
+            reach_px: limit on the distance of a first pair; 1.3 of it for those found later.
+            onward: a marker is searched for so many times its neighbours' mean displacement away.
+            turns: largest number of searches.
         """
         change = np.empty(self._modes)
-        _compiled().fit(self._basis, weight, off, from_start, ridge, change)
-        return change
+        _compiled().grow(
+            self._basis,
+            self._rough,
+            self._base,
+            coefficients,
+            np.ascontiguousarray(start),
+            ridge,
+            np.ascontiguousarray(points),
+            neighbours,
+            reach_px,
+            onward,
+            turns,
+            change,
+        )
+        return coefficients + change
 
     def settle(
         self,
@@ -364,6 +447,7 @@ class Modes:
         settled = np.array(coefficients, dtype=np.float64)
         _compiled().settle(
             self._basis,
+            self._rough,
             self._base,
             np.ascontiguousarray(start),
             ridge,
@@ -409,3 +493,41 @@ def affine(weight: NDArray[np.float32], bias: NDArray[np.float32], x: NDArray[np
     result = np.empty(len(bias), np.float32)
     _FOUND.affine(weight, bias, x, result)
     return result
+
+
+class HalfLayers:
+    """Layers of networks side by side, x W + b each, with weights rounded to half precision.
+
+    The time of a layer is that of reading its weights, and half precision halves it; it is off by 2^-11 of each weight.
+    A processor that does not read half precision gets the same results from the same weights, in single precision.
+
+    Args:
+        weight: (networks, inputs, outputs), each within +-65504.
+        bias: (networks, outputs).
+    """
+
+    def __init__(self, weight: NDArray[np.float32], bias: NDArray[np.float32]) -> None:
+        networks, inputs, self._outputs = weight.shape
+        into, out = -(-inputs // _TILE), -(-self._outputs // _TILE)
+        padded = np.zeros((networks, into * _TILE, out * _TILE), np.float16)
+        padded[:, :inputs, : self._outputs] = weight
+        self._bias = np.zeros((networks, out * _TILE), np.float32)
+        self._bias[:, : self._outputs] = bias
+        self._halves = _FOUND is not None and _FOUND.reads_halves()
+        if self._halves:
+            tiles = padded.reshape(networks, into, _TILE, out, _TILE).transpose(0, 1, 3, 2, 4)
+            self._weight: NDArray[np.floating] = np.ascontiguousarray(tiles).reshape(networks, into, out, _TILE**2)
+        else:
+            self._weight = padded.astype(np.float32)
+
+    def __call__(self, x: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return (networks, outputs) of inputs (networks, inputs)."""
+        result = np.empty_like(self._bias)
+        if self._halves and _FOUND is not None:
+            _FOUND.affine_of_halves(self._weight, self._bias, x, result)
+        else:
+            padded = np.zeros((len(x), self._weight.shape[1]), np.float32)
+            padded[:, : x.shape[1]] = x
+            for weight, bias, each, to in zip(self._weight, self._bias, padded, result, strict=True):
+                to[:] = affine(weight, bias, each)
+        return result[:, : self._outputs]

@@ -70,14 +70,15 @@ class MarkerEstimator:
         if model.header.transfer is not None:
             layers = [(weight.astype(np.float32), bias.astype(np.float32)) for weight, bias in layers_of(model)]
             self._transferred = TransferredNetworks(model, layers, self._matcher.model.reference)
-        self._layers = [
-            (model.tensors[f"layer{i}.weight"], model.tensors[f"layer{i}.bias"][:, 0])
-            for i in range(len(architecture.hidden) + 1)
-        ]
         # One long product is faster than several short ones with the same input.
-        first, bias = self._layers.pop(0)
-        self._first = np.ascontiguousarray(first.transpose(1, 0, 2)).reshape(first.shape[1], -1)
-        self._first_bias = bias.reshape(-1)
+        first, bias = model.tensors["layer0.weight"], model.tensors["layer0.bias"][:, 0]
+        self._first = kernels.HalfLayers(
+            np.ascontiguousarray(first.transpose(1, 0, 2)).reshape(1, first.shape[1], -1), bias.reshape(1, -1)
+        )
+        self._layers = [
+            kernels.HalfLayers(model.tensors[f"layer{i}.weight"], model.tensors[f"layer{i}.bias"][:, 0])
+            for i in range(1, len(architecture.hidden) + 1)
+        ]
 
     @classmethod
     def load(cls, path: Path) -> MarkerEstimator:
@@ -132,14 +133,13 @@ class MarkerEstimator:
         if self._transferred is not None:
             means, sigmas = self._transferred(field.displacements.reshape(1, -1))
             return means[0], sigmas[0]
-        x = kernels.affine(self._first, self._first_bias, field.displacements.ravel().astype(np.float32))
-        x = x.reshape(self._networks, -1)
-        for weight, bias in self._layers:
+        x = self._first(field.displacements.reshape(1, -1).astype(np.float32)).reshape(self._networks, -1)
+        for layer in self._layers:
             # Below -80 the exponential overflows, and the product is zero to float32 anyway.
-            active = x / (1.0 + np.exp(-np.maximum(x, np.float32(-80.0))))
-            x = np.stack([kernels.affine(*each) for each in zip(weight, bias, active, strict=True)])
+            x = layer(np.asarray(x / (1.0 + np.exp(-np.maximum(x, np.float32(-80.0)))), np.float32))
         outputs = x.astype(np.float64)
-        log_precision = np.clip(outputs[:, 6:], *LOG_PRECISION_BOUNDS)
+        least, most = LOG_PRECISION_BOUNDS
+        log_precision = np.minimum(np.maximum(outputs[:, 6:], least), most)
         return mixed(outputs[:, :6], log_precision, self.header.labels)
 
     def decode(self, field: MarkerField, mean: Array, sigma: Array) -> Prediction:

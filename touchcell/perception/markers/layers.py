@@ -51,7 +51,7 @@ def mixed(means: Array, log_precisions: Array, labels: Labels) -> tuple[Array, A
     Returns:
         (..., 6) and (..., 6).
     """
-    mean = means.mean(axis=0)
+    mean: Array = means.sum(axis=0) / len(means)
     apart = labels.aligned(means - mean, mean)
-    variance = np.exp(-2.0 * log_precisions).mean(axis=0) + np.square(apart).mean(axis=0)
+    variance = (np.exp(-2.0 * log_precisions) + np.square(apart)).sum(axis=0) / len(means)
     return mean, np.sqrt(variance)

@@ -40,6 +40,7 @@ _MOST_STARTS = 2
 _RINGS_GROWN = 6
 _NEIGHBOURS = 7
 _ONWARD = 1.2
+_SAMPLED = 4  # Where to start is judged by one marker in four.
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,12 +155,6 @@ class FirstGuess:
         density = disc_density(batch, np.ones(batch.shape[:2]), self.low, self.cell_px, grid)
         return density.reshape(*centres.shape[:-2], -1)
 
-    def __call__(self, density: NDArray[np.float32]) -> Array:
-        """Return (k,) coefficients over their standard deviations, of a density (grid * grid,)."""
-        hidden = np.maximum(kernels.affine(self.hidden_weight, self.hidden_bias, density), 0.0)
-        guess: Array = (np.einsum("ij,j->i", self.weight, hidden) + self.bias).astype(np.float64)
-        return guess
-
 
 def disc_density(centres: Array, weights: Array, low: Array, cell_px: float, grid: int) -> NDArray[np.float32]:
     """Return the density of discs in each cell of a grid, each distributed bilinearly over the four nearest cells.
@@ -203,7 +198,7 @@ class MarkerMatcher:
     ) -> None:
         self.model = model
         self._guess = guess
-        self._size = np.array(image_size[::-1], dtype=np.float64)
+        self._hidden = kernels.HalfLayers(guess.hidden_weight[None], guess.hidden_bias[None])
         self._bank = bank
         self._least_score = least_score
         self._most_rms_px = most_rms_px
@@ -211,6 +206,8 @@ class MarkerMatcher:
         self._modes = kernels.Modes(model.base, model.basis)
         self._spacing_px = model.spacing_px
         self._reach = 0.3 * self._spacing_px
+        height, width = image_size
+        self._view = np.array([self._reach, self._spacing_px, 0.5 * self._spacing_px, width, height], np.float64)
         apart = np.linalg.norm(model.reference[:, None] - model.reference[None], axis=2)
         nearest = np.argsort(apart, axis=1)[:, 1 : _NEIGHBOURS + 1]
         # Markers of the rim have fewer neighbours: the number of markers is the index of a missing one.
@@ -258,7 +255,7 @@ class MarkerMatcher:
 
     def _is_near(self, previous: MarkerField, centres: Array) -> bool:
         """Return True if most markers of the previous frame still have a disc close by."""
-        _, square, _ = kernels.pair(self.model.positions(previous.coefficients), centres)
+        square = self._modes.squares_apart(previous.coefficients, centres, _SAMPLED)
         return bool(np.count_nonzero(square < self._reach**2) > _STILL_THERE * len(square))
 
     def match_from(self, discs: Discs, starts: Iterable[Array]) -> MarkerField:
@@ -272,7 +269,7 @@ class MarkerMatcher:
         Each is first tried with a single iteration: a start that fails costs ten times as much.
         """
         density = self._guess.density(centres)
-        guess = self._guess(density) * self.model.sd
+        guess = self._guessed(density)
         off = self._off(guess, centres)
         if off < _NEAR * self._spacing_px:
             yield guess, self._guess_sd
@@ -284,9 +281,15 @@ class MarkerMatcher:
         for i in order:
             yield similar[i], 0.4 * self.model.sd
 
+    def _guessed(self, density: NDArray[np.float32]) -> Array:
+        """Return the first guess's (k,) coefficients of a density (grid * grid,)."""
+        hidden = np.maximum(self._hidden(density[None])[0], 0.0)
+        guess: Array = (np.einsum("ij,j->i", self._guess.weight, hidden) + self._guess.bias) * self.model.sd
+        return guess
+
     def _off(self, coefficients: Array, centres: Array) -> float:
         """Return the median distance px of the predicted markers from their nearest discs."""
-        _, square, _ = kernels.pair(self.model.positions(coefficients), centres)
+        square = self._modes.squares_apart(coefficients, centres, _SAMPLED)
         middle = (len(square) - 1) // 2, len(square) // 2
         return math.sqrt(0.5 * float(np.partition(square, middle)[list(middle)].sum()))
 
@@ -322,52 +325,31 @@ class MarkerMatcher:
 
     def _grow(self, coefficients: Array, start: Array, ridge: Array, centres: Array) -> Array:
         """Return the coefficients after markers without a disc were searched for where their neighbours predict."""
-        predicted = self.model.positions(coefficients)
-        partner, paired = pair(predicted, centres, self._reach)
-        off = np.where(paired[:, None], centres[partner] - predicted, 0.0)
-        missing = np.zeros((1, 2))
-        for _ in range(_RINGS_GROWN):
-            near_by = np.append(paired, False)[self._neighbours].sum(axis=1)
-            expected: Array = (
-                np.concatenate([off, missing])[self._neighbours].sum(axis=1) / np.maximum(near_by, 1.0)[:, None]
-            )
-            corrected = predicted + np.where(paired[:, None], off, _ONWARD * expected)
-            before = int(paired.sum())
-            partner, paired = pair(corrected, centres, 1.3 * self._reach)
-            paired &= near_by >= 2
-            off = np.where(paired[:, None], centres[partner] - predicted, 0.0)
-            if int(paired.sum()) <= before:
-                break
-        return coefficients + self._modes.fit(paired.astype(np.float64), off, start - coefficients, ridge)
+        return self._modes.grow(
+            coefficients,
+            start,
+            ridge,
+            centres,
+            self._neighbours,
+            reach_px=self._reach,
+            onward=_ONWARD,
+            turns=_RINGS_GROWN,
+        )
 
     def _field(self, coefficients: Array, centres: Array) -> MarkerField:
-        predicted = self.model.positions(coefficients)
-        partner, square, own = kernels.pair(predicted, centres)
-        paired = own & (square < self._reach**2)
-        positions = np.where(paired[:, None], centres[partner], predicted)
-        left_over = np.ones(len(centres), bool)
-        left_over[partner[paired]] = False
-        among = 0
-        if left_over.any():
-            _, apart, _ = kernels.pair(centres[left_over], predicted)
-            among = int(np.count_nonzero(apart < self._spacing_px**2))
-        margin = 0.5 * self._spacing_px
-        u, v = predicted.T
-        width, height = self._size
-        in_view = (u >= margin) & (u <= width - 1.0 - margin) & (v >= margin) & (v <= height - 1.0 - margin)
-        found = int(np.count_nonzero(paired))
-        expected = max(int(np.count_nonzero(in_view | paired)), found + among, 1)
-        rms = math.sqrt(float(square[paired].mean())) if found else math.inf
-        score = found / expected
+        sighted = self._modes.find(coefficients, centres, self._view)
+        found = sighted.found
+        rms = math.sqrt(sighted.squares / found) if found else math.inf
+        score = found / max(sighted.expected, found + sighted.among, 1)
         return MarkerField(
-            positions=positions,
-            displacements=positions - self.model.reference,
-            seen=paired,
+            positions=sighted.positions,
+            displacements=sighted.positions - self.model.reference,
+            seen=sighted.seen,
             coefficients=coefficients,
             score=score,
             rms_px=rms,
-            explained=found / max(found + among, 1),
-            valid=score >= self._least_score and rms <= self._most_rms_px and found >= len(positions) // 2,
+            explained=found / max(found + sighted.among, 1),
+            valid=score >= self._least_score and rms <= self._most_rms_px and found >= len(sighted.seen) // 2,
         )
 
     def _nothing(self) -> MarkerField:
