@@ -1,8 +1,8 @@
 """The marker estimator beside another checkout's: the same model and camera frames, processes by turns in one run.
 
-CPU time of ``predict`` from a grey 640x480 frame unlike the one before, the fastest of several passes through all
-frames, and the time from a fresh process to its first
-estimate. The other checkout reads a copy of the model file without what its version does not know.
+CPU time of ``predict`` from a grey 640x480 frame unlike the one before, the fastest of several passes through them all,
+and the time from a fresh process to its first estimate; and the networks' layers alone beside NumPy's BLAS. The other
+checkout reads a copy of the model file without what its version does not know.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
+import os
 import subprocess
 import sys
 import tempfile
@@ -106,11 +107,50 @@ def run(arguments: Sequence[str], out: Path) -> None:
     for key in ("median", "p99"):
         share = min(a[key] for a in now) / min(b[key] for b in other)
         lines.append(f"{key}: {share:.2f} of the other's")
+    networks = beside_blas(load_model(options.model))
+    lines.append("the networks' layers, us, 10 %, median and 90 % of 400, caches filled with other data before each:")
+    lines += [f"  {name:<24}{low:.0f}   {middle:.0f}   {high:.0f}" for name, (low, middle, high) in networks.items()]
     print("\n".join(lines))
     (out / "perception_against.txt").write_text("\n".join(lines) + "\n")
     (out / "perception_against.json").write_text(
-        json.dumps({"provenance": provenance(), "rows": found}, indent=1) + "\n"
+        json.dumps({"provenance": provenance(), "rows": found, "layers_us": networks}, indent=1) + "\n"
     )
+
+
+def beside_blas(model: Model) -> dict[str, tuple[float, float, float]]:
+    """Return the times of a marker model's layers, us: as the estimator computes them, and in BLAS in float32."""
+    from touchcell.perception.kernels import HalfLayers
+
+    count = sum(name.startswith("layer") and name.endswith("weight") for name in model.tensors)
+    weights = [model.tensors[f"layer{i}.weight"] for i in range(count)]
+    biases = [model.tensors[f"layer{i}.bias"][:, 0] for i in range(count)]
+    halves = [HalfLayers(weight, bias) for weight, bias in zip(weights, biases, strict=True)]
+    rng = np.random.default_rng(0)
+    inputs = [rng.normal(size=weight.shape[:2]).astype(np.float32) for weight in weights]
+
+    def ours() -> None:
+        for layer, x in zip(halves, inputs, strict=True):
+            layer(x)
+
+    def blas() -> None:
+        for weight, x in zip(weights, inputs, strict=True):
+            for matrix, row in zip(weight, x, strict=True):
+                np.dot(row, matrix)
+
+    filled = np.zeros(4 << 20, np.uint8)
+    threads = os.environ.get("OPENBLAS_NUM_THREADS", "all")
+    named = {"halves": ours, f"BLAS, threads: {threads}": blas}
+    times: dict[str, list[int]] = {name: [] for name in named}
+    for turn in range(400):
+        for name, call in named.items():
+            filled.fill(turn % 256)
+            begun = time.perf_counter_ns()
+            call()
+            times[name].append(time.perf_counter_ns() - begun)
+    return {
+        name: (float(low), float(middle), float(high))
+        for name, (low, middle, high) in ((n, 1e-3 * np.percentile(t, [10, 50, 90])) for n, t in times.items())
+    }
 
 
 def write_old(model: Model, path: Path) -> None:

@@ -123,3 +123,13 @@ def test_a_calibration_adds_what_other_sessions_have() -> None:
     np.testing.assert_allclose(validated, 0.02, rtol=0.15)
     np.testing.assert_allclose(own, np.hypot(validated, offset))
     np.testing.assert_allclose(header.calibrated(np.full(6, 0.02)), own)
+
+
+@pytest.mark.parametrize("shear", [0.0, 0.5, 3.0, 9.0])
+def test_one_contact_has_the_direction_and_variance_that_many_have(shear: float) -> None:
+    contacts = np.array([[0.6 * shear, -0.8 * shear, 2.5, 5.0, -4.0, 7.0], [0.0, 0.0, -0.1, 1.0, 2.0, -3.0]])
+    for one, direction, variance in zip(
+        contacts, shear_direction(contacts), OTHER_SESSIONS.variance(contacts), strict=True
+    ):
+        np.testing.assert_allclose(shear_direction(one), direction, atol=1e-15)
+        np.testing.assert_allclose(OTHER_SESSIONS.variance(one), variance, rtol=1e-14)

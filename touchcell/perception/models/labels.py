@@ -57,7 +57,7 @@ def shear_direction(contact_mm_deg: Array) -> Array:
     """Return (..., 2) unit vectors along the shear (x, y) of contacts (..., 6); along x where there is none."""
     shear = np.asarray(contact_mm_deg)[..., :2]
     if shear.ndim == 1:
-        # A fifth of the time of arrays, in every frame.
+        # As in every frame: numbers take a fifth of the time of arrays.
         x, y = shear.tolist()
         length = math.hypot(x, y)
         return np.array([x / length, y / length]) if length > _NO_SHEAR_MM else _ALONG_X

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import tempfile
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Literal
@@ -83,20 +84,31 @@ class Labels(BaseModel):
         """True if they are contacts rather than exponential coordinates."""
         return self.names == CONTACT_NAMES
 
+    @cached_property
+    def _ranges(self) -> tuple[Array, Array, Array]:
+        """Centre, half range, and the half range with one for both directions of shear; read-only."""
+        half = 0.5 * np.subtract(self.high, self.low, dtype=np.float64)
+        shared = half.copy()
+        shared[:2] = half[:2].mean()
+        ranges = 0.5 * np.add(self.low, self.high, dtype=np.float64), half, shared
+        for each in ranges:
+            each.setflags(write=False)
+        return ranges
+
     @property
     def centre(self) -> Array:
         """(6,) centre of the range."""
-        return _ranges(self.low, self.high)[0]
+        return self._ranges[0]
 
     @property
     def half_range(self) -> Array:
         """(6,) half of the range."""
-        return _ranges(self.low, self.high)[1]
+        return self._ranges[1]
 
     @property
     def sigma_unit(self) -> Array:
         """(6,) unit of the standard deviations: the half range, one for both directions of shear."""
-        return _ranges(self.low, self.high)[2 if self.are_contacts else 1]
+        return self._ranges[2 if self.are_contacts else 1]
 
     def targets(self, xi: Array) -> Array:
         """Return (n, 6) training targets for contacts with exponential coordinates (n, 6), m and rad."""
@@ -152,18 +164,6 @@ class Labels(BaseModel):
         return xi_gaussian(values, covariance)
 
 
-@lru_cache(maxsize=8)
-def _ranges(low: Six, high: Six) -> tuple[Array, Array, Array]:
-    """Return centre, half range, and the half range with one for both directions of shear; read-only and cached."""
-    half = 0.5 * np.subtract(high, low, dtype=np.float64)
-    shared = half.copy()
-    shared[:2] = half[:2].mean()
-    ranges = 0.5 * np.add(low, high, dtype=np.float64), half, shared
-    for each in ranges:
-        each.setflags(write=False)
-    return ranges
-
-
 class SessionSpread(BaseModel):
     """What changes from one session of a sensor to the next: friction, and the zero of mount and camera.
 
@@ -186,6 +186,8 @@ class SessionSpread(BaseModel):
 
     def variance(self, contacts: Array | None) -> Array:
         """Return (..., 6) mm^2 and deg^2 at contacts (..., 6), mm and degrees; of the offsets alone without these."""
+        if contacts is not None and contacts.ndim == 1:
+            return self._variance_at(contacts)
         variance = np.empty((6,) if contacts is None else contacts.shape)
         variance[...] = self.offset_mm_deg
         variance *= variance
@@ -197,6 +199,16 @@ class SessionSpread(BaseModel):
         variance[..., 0] += (self.slip * slips * shear) ** 2
         variance[..., 5] += (self.torsion_slip * slips * contacts[..., 5]) ** 2
         return variance
+
+    def _variance_at(self, contact: Array) -> Array:
+        """Return the (6,) of one contact (6,), as in every frame: numbers take a fifth of the time of arrays."""
+        x, y, depth, _, _, torsion = contact.tolist()
+        shear = math.hypot(x, y)
+        slips = min(max(shear / (self.free * max(depth, 1e-3)) - 1.0, 0.0), 1.0)
+        u, v, z, alpha, beta, gamma = self.offset_mm_deg
+        along = u * u + (self.slip * slips * shear) ** 2
+        about = gamma * gamma + (self.torsion_slip * slips * torsion) ** 2
+        return np.array([along, v * v, z * z, alpha * alpha, beta * beta, about])
 
 
 class Header(BaseModel):
