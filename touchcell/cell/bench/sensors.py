@@ -158,9 +158,9 @@ def _cell(frames: Path, sensors: int, rate_hz: float, model: str, where: str) ->
         plan = plan_cell(path)
         cells = [compose(plan) for _ in range(sensors)]
     names = ["sensor", *(f"sensor {i}" for i in range(1, sensors))]
-    section, camera = plan.cell.sensors["sensor"], plan.sensors["sensor"]
+    section, device = plan.cell.sensors["sensor"], plan.sensors["sensor"]
     together = plan.cell.model_copy(update={"sensors": dict.fromkeys(names, section)})
-    threaded = threaded_sensors(together, dict.fromkeys(names, camera))
+    threaded = threaded_sensors(together, dict.fromkeys(names, device))
     for name, cell in zip(names, cells, strict=True):
         cell.sensors["sensor"].threaded = name in threaded
     return dataclasses.replace(
