@@ -17,6 +17,7 @@ BENCHMARKS = {
     "calibration": "benchmarks.calibration",
     "emulated-push": "benchmarks.emulated_push",
     "executors": "benchmarks.executors",
+    "false-trips": "benchmarks.false_trips",
     "faults": "tests.fault_injection.faults",
     "filter": "benchmarks.filter",
     "findings": "tests.fault_injection.findings",

@@ -249,6 +249,7 @@ SPEC = TaskSpec(
     sensors=frozenset({LEADER_SENSOR, FOLLOWER_SENSOR}),
     build=build,
     starts_free=True,
+    glides=True,
     places=lambda config, start, mount: config.planned_places(LEADER),
     motions=lambda config, start, mount: servo_motions(config),
 )

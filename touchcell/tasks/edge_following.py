@@ -211,6 +211,7 @@ SPEC = TaskSpec(
     frozenset({SENSOR}),
     _build,
     starts_free=True,
+    glides=True,
     feature=EDGE.name,
     motions=lambda config, start, mount: _motions(config),
 )

@@ -230,6 +230,7 @@ class TaskSpec(Generic[TaskConfigT]):
         motions: returns what a configuration surely does, likewise.
         starts_free: True if its sensors must not touch anything when it begins.
         feature: what the contacts of its sensors must be of; None for a task to which it is the same.
+        glides: True if its contacts glide over what they touch, or are carried along by it.
         of_cell: returns the spec with the roles of a cell, for a task whose arms and sensors are those that the cell
             has: called with the roles of the arms and of the sensors that ``task:`` names, or else with all of them.
     """
@@ -247,6 +248,7 @@ class TaskSpec(Generic[TaskConfigT]):
     places: Callable[[TaskConfigT, Array | None, Array], Iterable[PlannedPlace]] | None = None
     motions: Callable[[TaskConfigT, Array | None, Array], Iterable[PlannedMotion]] | None = None
     feature: Feature | None = "surface"
+    glides: bool = False
     of_cell: Callable[[frozenset[str], frozenset[str]], TaskSpec[TaskConfigT]] | None = None
 
     def needs_wrenches(self, config: TaskConfigT) -> Mapping[str, str]:

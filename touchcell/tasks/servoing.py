@@ -620,7 +620,7 @@ def one_arm_task(
     places: Callable[[ServoConfigT, Array | None, Array], Iterable[PlannedPlace]] | None = None,
     motions: Callable[[ServoConfigT, Array | None, Array], Iterable[PlannedMotion]] | None = None,
 ) -> TaskSpec[ServoConfigT]:
-    """Return the spec of a task in which ``arm`` holds a contact with ``sensor`` and runs one behavior.
+    """Return the spec of a task in which ``arm`` holds a gliding contact with ``sensor`` and runs one behavior.
 
     Args:
         name: of the task.
@@ -644,6 +644,7 @@ def one_arm_task(
         frozenset({SENSOR}),
         build,
         starts_free=True,
+        glides=True,
         places=places,
         motions=motions or (lambda config, start, mount: servo_motions(config)),
     )

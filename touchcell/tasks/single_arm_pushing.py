@@ -412,6 +412,7 @@ SPEC = TaskSpec(
     sensors=frozenset({SENSOR}),
     build=build,
     starts_free=True,
+    glides=True,
     places=lambda config, start, mount: config.planned_places(ARM),
     motions=_motions,
 )

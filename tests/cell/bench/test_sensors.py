@@ -1,4 +1,4 @@
-"""``touchcell bench sensors``: two sensors in one real-time cell, perceived in the loop's thread and in workers."""
+"""``touchcell bench sensors``: two sensors in one real-time cell, perceived in the loop's thread and in their own."""
 
 from __future__ import annotations
 
@@ -16,16 +16,20 @@ def test_every_sensor_delivers_estimates(tmp_path: Path, capsys: pytest.CaptureF
     words = ["--", "--sensors", "2", "--rates", "30", "--seconds", "1.2"]
     assert main(["bench", "sensors", "--out", str(tmp_path), *words]) == EXIT_OK
     rows = json.loads((tmp_path / "sensors.json").read_text())["rows"]
-    assert [(row["sensors"], row["workers"]) for row in rows] == [(2, False), (2, True)]
+    assert [(row["perceive_in"], row["threads"]) for row in rows] == [
+        ("loop", False),
+        ("threads", True),
+        ("auto", True),
+    ]
     for row in rows:
         # Of the sensor with the fewest estimates.
         assert row["estimates_per_s"] > 0.0
         assert 0.0 < row["new_age_ms"]["median"] <= row["new_age_ms"]["p99"]
-    assert "worker threads" in capsys.readouterr().out
+    assert "auto, threads" in capsys.readouterr().out
 
 
-def test_a_failed_worker_raises_in_the_loop(tmp_path: Path) -> None:
+def test_a_failed_thread_raises_in_the_loop(tmp_path: Path) -> None:
     (tmp_path / "frame_0.jpg").write_bytes(b"no image")
-    for workers in (False, True):
+    for where in ("loop", "threads"):
         with pytest.raises(Exception, match="not a complete"):
-            measure(tmp_path, 1, 30.0, 1.0, "builtin:sim_gdn", workers=workers)
+            measure(tmp_path, 1, 30.0, 1.0, "builtin:sim_gdn", where)

@@ -177,3 +177,14 @@ def test_a_data_set_that_nothing_reads_is_refused(tmp_path: Path, capsys: pytest
 def test_a_base_whose_name_is_too_long_for_a_file(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="extends: no such file"):
         plan_cell(written(tmp_path, ("schema: 1", f"schema: 1\nextends: {'9' * 5000}x")))
+
+
+@pytest.mark.parametrize("cell", ["surface_follow_sim", "object_track_sim", "single_push_sim", "dual_push_sim"])
+def test_a_filter_that_counts_from_first_touch_is_refused_where_the_contact_glides(cell: str) -> None:
+    path = CONFIGS / f"{cell}.yaml"
+    name = next(iter(yaml.safe_load(path.read_text())["sensors"]))
+    with pytest.raises(InvalidCell) as caught:
+        plan_cell(path, settings={f"sensors.{name}.estimator.filter": {"model": "slip_aware"}})
+    (problem,) = caught.value.problems
+    assert problem.key == f"sensors.{name}.estimator.filter.model"
+    assert problem.hint == "model: stick_slip"

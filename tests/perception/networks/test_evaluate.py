@@ -14,6 +14,7 @@ from tests.helpers.tactile_samples import CENTRE, contacts, draw, write_split
 from tests.perception.runtime.test_inference import constant_model
 from touchcell.drivers.core.clock import VirtualClock
 from touchcell.errors import DataError
+from touchcell.paths import MODELS
 from touchcell.perception.errors import ImageError, ModelError
 from touchcell.perception.models.labels import XI_UNITS, xi_from_contact
 from touchcell.perception.models.model_file import Labels, load_model, save_model
@@ -151,3 +152,21 @@ def test_bad_inputs(data: Path, model: Path, tmp_path: Path) -> None:
         cv2.imwrite(str(path), draw(CENTRE, (40, 40)))
     with pytest.raises(ImageError):
         evaluate(data, "val", model)
+
+
+@pytest.mark.parametrize(
+    ("shipped", "remedy"),
+    [
+        ("sim_gdn", "an image network sees one camera only: `touchcell train --data {data} --out NAME.safetensors`"),
+        ("sim_shape", "`touchcell adapt --data {data}` brings it to this one, by ten labelled images or more"),
+        ("sim_franka_tactip_1", "use `touchcell adapt` with the model that it came from"),
+    ],
+)
+def test_images_of_another_size_are_refused_with_what_helps(data: Path, shipped: str, remedy: str) -> None:
+    with pytest.raises(ImageError) as refused:
+        evaluate(data, "val", MODELS / f"{shipped}.safetensors")
+    assert refused.value.attribute == "size"
+    assert refused.value.expected == (480, 640)
+    assert refused.value.hint is not None
+    assert refused.value.hint.startswith(f"{shipped} is for another camera or crop")
+    assert refused.value.hint.endswith(remedy.format(data=data))

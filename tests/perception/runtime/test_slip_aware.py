@@ -182,3 +182,22 @@ def test_frames_closer_together_than_they_are_independent_count_as_one() -> None
             state = contact_filter.update(observed, T_f_s, round(k * 5e9 / frames))
         sigmas.append(np.sqrt(np.diagonal(state.belief.covariance)))
     np.testing.assert_allclose(sigmas[0], sigmas[1], rtol=0.05)
+
+
+@pytest.mark.parametrize(
+    ("axes", "trips"), [((1, 1, 1), False), ((-1, -1, 1), True), ((1, -1, 1), True), ((-1, 1, 1), True)]
+)
+def test_a_camera_that_is_mounted_turned_or_mirrored_trips_the_shipped_rule_and_a_good_one_never(
+    axes: tuple[int, int, int], trips: bool
+) -> None:
+    law, seen = ContactLaw(slip_at_1mm_m=0.34e-3, torsion_grip=0.1), np.diag([*axes, 1.0])
+    for seed in range(3):
+        sequence, contact_filter = random_sequence(150, seed, law), slip_aware()
+        rng, beyond, longest = np.random.default_rng(seed), 0, 0
+        for k, (sensor, held) in enumerate(zip(sequence.T_f_s, sequence.held, strict=True)):
+            xi = se3.log(se3.inverse(seen @ held @ seen)) + SIGMA * rng.standard_normal(6)
+            state = contact_filter.update(gaussian.from_exponential(xi, np.diag(SIGMA**2)), sensor, k * PERIOD_NS)
+            beyond = beyond + 1 if state.nis is not None and state.nis > 22.5 else 0
+            longest = max(longest, beyond)
+        # interlocks: {kind: inconsistent, limit_nis: 22.5, frames: 5}
+        assert (longest >= 5) == trips

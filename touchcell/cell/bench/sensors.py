@@ -1,8 +1,9 @@
 """``touchcell bench sensors``: several sensors in one cell in real time: age of their estimates, and starvation.
 
 Cameras play recorded JPEG frames of 640x480 px, as fast as real ones and decoded when they are read. One control loop
-at 100 Hz reads all of them. It either perceives in its own thread, as the product does, or reads the results of one
-worker thread per sensor. An estimate's age is counted from the exposure of its frame until the loop has read it.
+at 100 Hz reads all of them. Each case is measured with every value of the cell's ``perceive_in``: in the loop's thread,
+in a thread for each sensor, and as a cell does that says nothing. An estimate's age is counted from the exposure of its
+frame until the loop has read it.
 """
 
 from __future__ import annotations
@@ -12,7 +13,6 @@ import dataclasses
 import json
 import os
 import tempfile
-import threading
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -24,22 +24,17 @@ import yaml
 
 from touchcell.cell.bench.provenance import provenance
 from touchcell.cell.bench.quantiles import median_and_p99
+from touchcell.cell.config.perception_threads import threaded_sensors
 from touchcell.cell.config.schema import plan_cell
 from touchcell.cell.runtime.cell import Cell
 from touchcell.cell.runtime.compose import compose
 from touchcell.cell.runtime.loop import RunLoop
 from touchcell.cell.runtime.run_result import Progress
-from touchcell.cell.runtime.sensor import Sensor
 from touchcell.cell.runtime.stop_request import StopRequest
-from touchcell.drivers.core.clock import Clock
-from touchcell.geometry.types import Array
-from touchcell.perception.runtime.estimate import ContactEstimate
-from touchcell.perception.runtime.pipeline import ContactSource
 from touchcell.simulation.render import FrameRenderer
 from touchcell.simulation.samples import contacts
 
 _FRAMES = 60
-_POLL_S = 0.5e-3
 _WARM_UP_S = 0.5
 
 
@@ -61,8 +56,8 @@ def run(arguments: Sequence[str], out: Path) -> None:
         _write_frames(Path(folder), round(options.seconds * max(options.rates)) + 1)
         for count in options.sensors:
             for rate_hz in options.rates:
-                for workers in (False, True):
-                    row = measure(Path(folder), count, rate_hz, options.seconds, options.model, workers=workers)
+                for where in ("loop", "threads", "auto"):
+                    row = measure(Path(folder), count, rate_hz, options.seconds, options.model, where)
                     rows.append(row)
                     print(_line(row), flush=True)
     print("ages of the worst sensor; late: cycles longer than their 10 ms; CPU: of one core")
@@ -70,52 +65,57 @@ def run(arguments: Sequence[str], out: Path) -> None:
     (out / "sensors.json").write_text(json.dumps(report, indent=1) + "\n")
 
 
-def measure(frames: Path, sensors: int, rate_hz: float, seconds: float, model: str, *, workers: bool) -> dict[str, Any]:
-    """Run one cell with that many sensors for that long; return a row of the table."""
+def measure(frames: Path, sensors: int, rate_hz: float, seconds: float, model: str, where: str) -> dict[str, Any]:
+    """Run one cell with that many sensors, and that ``perceive_in``, for that long; return a row of the table."""
     stop = StopRequest()
-    fresh: dict[str, list[float]] = {}
-    ages: dict[str, list[float]] = {}
+    fresh: dict[str, list[tuple[float, float]]] = {}
+    ages: dict[str, list[tuple[float, float]]] = {}
     seen: dict[str, int] = {}
-    with _cell(frames, sensors, rate_hz, model) as cell:
-        started = [_threaded(sensor, cell.clock) for sensor in cell.sensors.values()] if workers else []
+    with _cell(frames, sensors, rate_hz, model, where) as cell:
+        threaded = any(sensor.threaded for sensor in cell.sensors.values())
 
         def look(progress: Progress) -> None:
             now_ns = cell.clock.now_ns()
             if progress.t_s > seconds:
                 stop.ask_at_once()
             for role, contact in progress.contacts.items():
-                age_ms = 1e-6 * (now_ns - contact.t_frame_ns)
-                if progress.t_s > _WARM_UP_S:
-                    ages.setdefault(role, []).append(age_ms)
-                    if seen.get(role) != contact.seq:
-                        fresh.setdefault(role, []).append(age_ms)
+                found = progress.t_s, 1e-6 * (now_ns - contact.t_frame_ns)
+                ages.setdefault(role, []).append(found)
+                if seen.get(role) != contact.seq:
+                    fresh.setdefault(role, []).append(found)
                 seen[role] = contact.seq
 
         cpu_s = time.process_time()
         result = RunLoop(cell, None, stop=stop, on_cycle=look).run()
         cpu_s = time.process_time() - cpu_s
-        for worker in started:
-            worker.finish()
     if result.error is not None:
         raise result.error
-    measured_s = result.duration_s - _WARM_UP_S
     cycles_ms = 1e-6 * np.array(result.times.rows["cycle"])
-    worst = max(fresh, key=lambda role: float(np.percentile(fresh[role], 99)))
+    new_ms = {role: _measured(each) for role, each in fresh.items()}
+    worst = max(new_ms, key=lambda role: float(np.percentile(new_ms[role], 99)))
     return {
         "sensors": sensors,
         "rate_hz": rate_hz,
-        "workers": workers,
-        "estimates_per_s": min(len(times) for times in fresh.values()) / measured_s,
-        "new_age_ms": median_and_p99(fresh[worst]),
-        "age_ms": median_and_p99(ages[worst]),
+        "perceive_in": where,
+        "threads": threaded,
+        "estimates_per_s": min(map(len, fresh.values())) / result.duration_s,
+        "new_age_ms": median_and_p99(new_ms[worst]),
+        "age_ms": median_and_p99(_measured(ages[worst])),
         "cycle_ms": median_and_p99(cycles_ms),
         "late": float((cycles_ms > 10.0).mean()),
         "cpu": cpu_s / result.duration_s,
     }
 
 
+def _measured(found: list[tuple[float, float]]) -> list[float]:
+    """Return what was measured after the first half second; all of it where the machine stood still afterwards."""
+    return [value for t_s, value in found if t_s > _WARM_UP_S] or [value for _, value in found]
+
+
 def _line(row: dict[str, Any]) -> str:
-    where = "worker threads" if row["workers"] else "loop's thread"
+    where = row["perceive_in"]
+    if where == "auto":
+        where += ", threads" if row["threads"] else ", loop"
     new, age, cycle = row["new_age_ms"], row["age_ms"], row["cycle_ms"]
     return (
         f"{row['sensors']:>7}{row['rate_hz']:>6.0f} {where:<15}{row['estimates_per_s']:>12.1f}{new['median']:>13.1f}"
@@ -135,7 +135,7 @@ def _write_frames(folder: Path, n: int) -> None:
         (folder / f"frame_{i}.jpg").write_bytes(kinds[i % len(kinds)])
 
 
-def _cell(frames: Path, sensors: int, rate_hz: float, model: str) -> Cell:
+def _cell(frames: Path, sensors: int, rate_hz: float, model: str, where: str) -> Cell:
     """Return an observing cell with any number of sensors: more than its task asks for."""
     estimator = {
         "kind": "network",
@@ -148,60 +148,23 @@ def _cell(frames: Path, sensors: int, rate_hz: float, model: str) -> Cell:
         "name": "sensors",
         "time": "real",
         "rate_hz": 100,
+        "perceive_in": where,
         "sensors": {"sensor": camera},
         "task": {"name": "observe"},
     }
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "cell.yaml"
         path.write_text(yaml.safe_dump(description))
-        cells = [compose(plan_cell(path)) for _ in range(sensors)]
+        plan = plan_cell(path)
+        cells = [compose(plan) for _ in range(sensors)]
     names = ["sensor", *(f"sensor {i}" for i in range(1, sensors))]
+    section, device = plan.cell.sensors["sensor"], plan.sensors["sensor"]
+    together = plan.cell.model_copy(update={"sensors": dict.fromkeys(names, section)})
+    threaded = threaded_sensors(together, dict.fromkeys(names, device))
+    for name, cell in zip(names, cells, strict=True):
+        cell.sensors["sensor"].threaded = name in threaded
     return dataclasses.replace(
         cells[0],
         cameras={name: cell.cameras["sensor"] for name, cell in zip(names, cells, strict=True)},
         sensors={name: cell.sensors["sensor"] for name, cell in zip(names, cells, strict=True)},
     )
-
-
-class _Worker(threading.Thread, ContactSource):
-    """Perceives in its own thread, as soon as there is a frame; the loop reads the latest result."""
-
-    def __init__(self, source: ContactSource, clock: Clock) -> None:
-        super().__init__(daemon=True)
-        self._source = source
-        self._clock = clock
-        self._finished = threading.Event()
-        self._newest: ContactEstimate | None = None
-        self._failure: BaseException | None = None
-
-    @property
-    def ended(self) -> bool:
-        return self._source.ended
-
-    def record_pose(self, t_ns: int, T_base_sensor: Array) -> None:
-        self._source.record_pose(t_ns, T_base_sensor)
-
-    def update(self, now_ns: int) -> ContactEstimate | None:
-        if self._failure is not None:
-            raise self._failure
-        return self._newest
-
-    def run(self) -> None:
-        """Poll for a new frame every half millisecond."""
-        try:
-            while not self._finished.wait(_POLL_S):
-                self._newest = self._source.update(self._clock.now_ns())
-        except BaseException as error:
-            self._failure = error
-
-    def finish(self) -> None:
-        """Stop, and wait for the end."""
-        self._finished.set()
-        self.join()
-
-
-def _threaded(sensor: Sensor, clock: Clock) -> _Worker:
-    worker = _Worker(sensor.source, clock)
-    sensor.source = worker
-    worker.start()
-    return worker

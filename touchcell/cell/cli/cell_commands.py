@@ -130,6 +130,7 @@ def _uncollected() -> Iterator[None]:
 def _check_cell(options: argparse.Namespace) -> int:
     from touchcell.cell.config.armed import proof_table
     from touchcell.cell.config.layers import explain, load_layers
+    from touchcell.cell.config.perception_threads import perception_line
     from touchcell.cell.config.settings import parse_settings
     from touchcell.cell.config.yaml_file import InvalidCell
     from touchcell.cell.runtime.worlds import plan_for
@@ -151,6 +152,8 @@ def _check_cell(options: argparse.Namespace) -> int:
     print(f"  task     {plan.task.name}: {plan.task.summary}")
     for device in plan.built.values():
         print(f"  {device.spec.capabilities.kind:<8} {device.name}: {device.spec.name}, {device.spec.summary}")
+    if perceived := perception_line(plan):
+        print(f"  perceives {perceived}")
     for name, way in plan.stopping_distances.items():
         print(f"  beyond {name}: {way}")
     for line in proof_table(plan):

@@ -12,6 +12,7 @@ from typing import Final
 from touchcell.cell.analysis.code_identity import digest_of
 from touchcell.cell.analysis.provenance import commit
 from touchcell.cell.config.cell_plan import CellPlan
+from touchcell.cell.config.perception_threads import perception_line
 from touchcell.cell.recording.recorder import Recorder
 from touchcell.cell.runtime.cell import Cell
 from touchcell.perception.runtime.network_estimator import NetworkEstimator, model_path
@@ -40,6 +41,7 @@ def describe_run(recorder: Recorder, cell: Cell) -> None:
             "world": plan.cell.world or "as written",
             "time": plan.cell.time,
             "seed": str(plan.cell.seed),
+            "perceives": perception_line(plan),
             "touchcell": version("touchcell"),
             "commit": commit(),
             "python": platform.python_version(),

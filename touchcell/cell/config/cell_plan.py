@@ -240,6 +240,9 @@ class CellFile(_Section):
         time: ``simulated`` runs as fast as it can on a virtual clock, ``real`` in real time.
         rate_hz: control cycles per second.
         processes: ``separate`` runs devices in processes of their own with a watchdog, in real time only.
+        perceive_in: where camera frames become contacts: the ``loop``'s thread, or ``threads`` of their own, one for
+            each sensor; ``auto`` takes threads where the frames of all sensors together, at 4 ms each, take more than
+            half of a cycle. Simulated cameras are always read in the loop's thread.
         seed: of everything random, from 0 on.
         max_duration_s: longest run; it is stopped then.
         scene: what is simulated around the arms, for simulated devices.
@@ -269,6 +272,7 @@ class CellFile(_Section):
     time: Literal["simulated", "real"]
     rate_hz: Annotated[float, Field(gt=0, le=1000)]
     processes: Literal["one", "separate"] = "one"
+    perceive_in: Literal["auto", "loop", "threads"] = "auto"
     seed: NonNegativeInt = 0
     max_duration_s: PositiveFloat = 3600.0
     scene: dict[str, Any] | None = None

@@ -109,7 +109,15 @@ def _features(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
                 hint="kind: true_edge in a simulated scene" if wanted == "edge" else "kind: network",
             )
         section = getattr(estimator, "filter", None)
-        predicted = FILTERS.load(section.model).feature if isinstance(section, FilterConfig) else estimator.feature
+        spec = FILTERS.load(section.model) if isinstance(section, FilterConfig) else None
+        if spec is not None and spec.anchored and plan.task.glides:
+            yield file.problem(
+                ("sensors", name, "estimator", "filter", "model"),
+                f"it counts a contact from where it was first touched, and {plan.task.name} glides on from there",
+                value=spec.name,
+                hint="model: stick_slip",
+            )
+        predicted = estimator.feature if spec is None else spec.feature
         if predicted != estimator.feature:
             yield file.problem(
                 ("sensors", name, "estimator", "filter"),

@@ -119,6 +119,8 @@ class Cell:
             for device in self.devices():
                 device.activate()
                 self._exit.callback(self._deactivate, device)
+            for sensor in self.sensors.values():
+                self._exit.callback(sensor.end)
             self.watchdog.self_test()
             self.start_ns = self.clock.now_ns()
             self._exit = self._exit.pop_all()

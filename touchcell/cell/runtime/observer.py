@@ -74,9 +74,16 @@ class Observer:
         return bool(sensors) and all(sensor.source.ended for sensor in sensors.values())
 
     def await_frames(self) -> None:
-        """Wait for each camera's first frame, so that no control cycle has to. Raises DeviceError."""
+        """Wait for each camera's first frame, so that no control cycle has to, and begin with the sensors' threads.
+
+        Raises:
+            DeviceError: a camera gives none.
+            ImageError: it is not what the model reads.
+        """
         for role, sensor in self._cell.sensors.items():
             call_driver(self._device(role), sensor.await_frame)
+        for role, sensor in self._cell.sensors.items():
+            call_driver(self._device(role), partial(sensor.begin, role))
 
     def read(self) -> Reading:
         """Read the arms and perceive. Raises DeviceError, ImageError."""

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from touchcell.cell.config.cell_plan import CellPlan
+from touchcell.cell.config.perception_threads import threaded_sensors
 from touchcell.cell.recording.messages import belief_message, pose_message
 from touchcell.drivers.core.device import Device
 from touchcell.drivers.core.protocols import FrameSource
@@ -35,6 +36,7 @@ class Sensor:
         true_edge: the simulator's own edge, for an estimator of edges.
         frames: how images are recorded.
         watched: whether an interlock reads the images.
+        threaded: whether frames are processed in a thread of their own, from ``begin`` to ``end``.
     """
 
     source: ContactSource
@@ -44,6 +46,7 @@ class Sensor:
     true_edge: ContactSource | None = None
     frames: str = "none"
     watched: bool = False
+    threaded: bool = False
     _recorded_seq: int = field(default=-1, init=False)
     _picture: tuple[int | None, float | None] = field(default=(None, None), init=False)
     _picture_seq: int = field(default=-1, init=False)
@@ -56,6 +59,16 @@ class Sensor:
     def await_frame(self) -> None:
         """Wait for the first frame, so that no control cycle has to. Raises DeviceError."""
         self.source.await_frame()
+
+    def begin(self, role: str) -> None:
+        """Begin with the thread, if this sensor has one; its first frame is there. Raises DeviceError, ImageError."""
+        if self.threaded and isinstance(self.source, ContactPipeline):
+            self.source.begin_thread(f"perceives {role}")
+
+    def end(self) -> None:
+        """End the thread, if there is one."""
+        if isinstance(self.source, ContactPipeline):
+            self.source.end_thread()
 
     def take_zero(self) -> Stamped[Frame] | None:
         """Take the newest frame for one out of contact, and return it; None from a source that uses none."""
@@ -141,6 +154,7 @@ def build_sensor(
         true_edge=edge,
         frames=plan.cell.recording.frames,
         watched=any(interlock.kind in ("frame_frozen", "exposure") for interlock in plan.cell.interlocks.values()),
+        threaded=name in threaded_sensors(plan.cell, plan.sensors),
     )
 
 

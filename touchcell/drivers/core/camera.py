@@ -7,6 +7,7 @@ between two reads. After a longer pause the queue is full of old frames; this is
 
 from __future__ import annotations
 
+import threading
 from abc import abstractmethod
 from dataclasses import dataclass
 from typing import Literal, Self, final
@@ -131,7 +132,7 @@ class RawFrame:
 
 
 class Camera(Device):
-    """Base class of live cameras; use an instance from one thread.
+    """Base class of live cameras; one thread reads frames, and another may ask for ``health`` meanwhile.
 
     Frames flow from READY on; ACTIVE adds nothing, because a camera moves nothing. ``configure`` applies the settings.
     The camera is FAULTED when it is disconnected, silent for ``stall_s``, sends more than 10 bad frames in 30, or makes
@@ -153,6 +154,7 @@ class Camera(Device):
         self._decoded: Stamped[Frame] | None = None
         self._since_ns = 0
         self._overflowed = False
+        self._at_queue = threading.Lock()
 
     @final
     def latest(self, max_age_s: float | None = None) -> Stamped[Frame]:
@@ -168,7 +170,8 @@ class Camera(Device):
             LifecycleError: not READY or ACTIVE.
         """
         self._require("read frames", Lifecycle.READY, Lifecycle.ACTIVE)
-        self._attempt(self._refresh)
+        with self._at_queue:
+            self._attempt(self._refresh)
         age_s = self._age_s()
         limit_s = self._config.stall_s if max_age_s is None else max_age_s
         if self._newest is None or age_s > limit_s:
@@ -187,7 +190,8 @@ class Camera(Device):
             LifecycleError: not READY or ACTIVE.
         """
         self._require("read frames", Lifecycle.READY, Lifecycle.ACTIVE)
-        self._attempt(lambda: self._await_after(after_seq, timeout_s, self._config.stall_s))
+        with self._at_queue:
+            self._attempt(lambda: self._await_after(after_seq, timeout_s, self._config.stall_s))
         if self._newest is None or self._newest.seq <= after_seq:
             raise TransportTimeout(self.name, f"frame after {after_seq}", timeout_s)
         return self._read(self._newest)
@@ -197,8 +201,9 @@ class Camera(Device):
         """Return frame counters (good, lost, unread, frozen, bad), brightness and its drift, settings as read back."""
         if self._state in (Lifecycle.READY, Lifecycle.ACTIVE):
             try:
-                self._refresh()
-                self._verify()
+                with self._at_queue:
+                    self._refresh()
+                    self._verify()
             except DeviceError as error:
                 self._to_faulted(error)
         return {

@@ -33,7 +33,7 @@ _EXPLAINED = 0.985
 _DEAD_PINS = 0.8  # Of the least score: a fifth of the pins may be missing.
 _DEAD_RMS = 0.5
 _STILL_THERE = 0.6
-_BANKED_AT_ONCE = 32
+_BANKED_AT_ONCE = 128
 _NEAR = 0.3  # Largest accepted error of a first guess, in spacings; failed ones are off by more.
 _ALIKE = 6
 _MOST_STARTS = 2
@@ -216,9 +216,10 @@ class MarkerMatcher:
         # Far from the training contacts, a guess is off by more than its own standard deviation.
         self._guess_sd = np.hypot(3.0 * guess.sd, 0.1 * model.sd)
         # All at once would briefly take 100 MB, which a process does not return to the system.
-        parts = range(0, len(bank), _BANKED_AT_ONCE)
+        parts = (bank[i : i + _BANKED_AT_ONCE] for i in range(0, len(bank), _BANKED_AT_ONCE))
+        places = (model.base + each @ model.basis for each in parts)
         self._bank_density = np.concatenate(
-            [_in_bytes(guess.density(model.positions(bank[i : i + _BANKED_AT_ONCE]))) for i in parts]
+            [_in_bytes(guess.density(each.reshape(len(each), -1, 2))) for each in places]
         )
 
     def match(self, discs: Discs, previous: MarkerField | None = None) -> MarkerField:

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from touchcell.errors import ConfigError
@@ -85,6 +84,8 @@ class CameraChange(BaseModel):
 
     def save(self, path: Path) -> None:
         """Write a calibration file."""
+        import yaml
+
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(yaml.safe_dump(self.model_dump(mode="json", by_alias=True), sort_keys=False), encoding="utf-8")
 
@@ -95,6 +96,8 @@ def load_change(path: Path) -> CameraChange:
     Raises:
         ConfigError: the file is missing or invalid.
     """
+    import yaml
+
     try:
         return CameraChange.model_validate(read_yaml(path))
     except OSError as error:

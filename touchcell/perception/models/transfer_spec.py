@@ -36,7 +36,7 @@ class BlockSpec(BaseModel):
         unit: standard deviation of its targets.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True)
 
     kernel: Annotated[tuple[Number, ...], Field(min_length=KERNEL, max_length=KERNEL)]
     mean: Number
@@ -65,7 +65,7 @@ class TransferSpec(BaseModel):
         floor: standard deviation in addition, mm and degrees; along and across the shear, then z, alpha, beta, gamma.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True)
 
     markers: int = Field(gt=0)
     contacts: int = Field(gt=1)

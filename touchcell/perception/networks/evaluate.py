@@ -111,7 +111,7 @@ def evaluate(
     with one_opencv_thread():
         for i, image in enumerate(labelled.read()):
             if i == 0:
-                _first(contact_model, image)
+                _first(contact_model, image, data, model)
             start_ns = clock.now_ns()
             predictions.append(contact_model.predict(image))
             latencies_ns[i] = clock.now_ns() - start_ns
@@ -135,13 +135,23 @@ def evaluate(
     )
 
 
-def _first(estimator: ContactEstimator, image: ImageArray) -> None:
-    """Predict once, as the first run also allocates memory."""
+def _first(estimator: ContactEstimator, image: ImageArray, data: Path, model: Path) -> None:
+    """Predict once, as the first run also allocates memory; say what to do with images that the model does not read."""
     try:
         estimator.predict(image)
     except ImageError as error:
-        hint = "the model is for another camera or crop; `touchcell adapt` brings a marker model to another sensor"
+        what = f"{model.stem} is for another camera or crop, and its contacts mean nothing here"
+        hint = f"{what}; {_remedy(estimator, data)}"
         raise ImageError(error.attribute, error.expected, error.found, hint=hint) from error
+
+
+def _remedy(estimator: ContactEstimator, data: Path) -> str:
+    header = estimator.header
+    if header.architecture.kind != "markers":
+        return f"an image network sees one camera only: `touchcell train --data {data} --out NAME.safetensors`"
+    if header.camera is not None:
+        return "it was adapted to its own sensor: use `touchcell adapt` with the model that it came from"
+    return f"`touchcell adapt --data {data}` brings it to this one, by ten labelled images or more"
 
 
 def print_table(evaluation: Evaluation, console: Console | None = None) -> None:

@@ -39,11 +39,14 @@ class EstimatorConfig(Section):
 
     Attributes:
         needs_truth: True if it can only be built where the true contact is known, as in a simulated scene.
+        reads_frames: True if it builds a ``ContactPipeline``, which takes milliseconds for each camera frame and may
+            run in a thread of its own.
         feature: what its contacts are of: a surface, or an edge of one (docs/explanation/edges.md).
         kind: which estimator.
     """
 
     needs_truth: ClassVar[bool] = False
+    reads_frames: ClassVar[bool] = False
     feature: ClassVar[Feature] = "surface"
 
     kind: str

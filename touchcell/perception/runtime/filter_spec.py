@@ -73,12 +73,15 @@ class FilterSpec:
         summary: one line for ``touchcell list``.
         config: pydantic model of its section, which builds the filter.
         feature: name of the feature whose motion relative to the sensor it predicts.
+        anchored: True if its contacts count from where they were first touched, on something that stands still: where a
+            contact glides or is carried along, its shear grows without end.
     """
 
     name: str
     summary: str
     config: type[FilterConfig]
     feature: str = "surface"
+    anchored: bool = False
 
 
 FILTERS: Final = Registry("touchcell.filters", "filter", FilterSpec)

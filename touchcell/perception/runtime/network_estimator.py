@@ -73,6 +73,8 @@ class NetworkEstimator(EstimatorConfig):
         filter: fuses the estimates over time; without it each frame stands by itself.
     """
 
+    reads_frames: ClassVar[bool] = True
+
     kind: Literal["network"]
     model: Annotated[str, _MODEL]
     calibration: Annotated[str | None, _CALIBRATION] = None

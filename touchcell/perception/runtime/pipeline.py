@@ -8,24 +8,23 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
 
-from touchcell.drivers.core.errors import EndOfStream
 from touchcell.drivers.core.protocols import FrameSource
 from touchcell.drivers.core.samples import Frame, Stamped
 from touchcell.geometry import gaussian
 from touchcell.geometry.gaussian import PoseGaussian
-from touchcell.geometry.types import Array, ImageArray
-from touchcell.perception.features.feature_model import NOTHING, FeatureModel
+from touchcell.geometry.types import Array
+from touchcell.perception.features.feature_model import FeatureModel
 from touchcell.perception.models.prediction import ContactEstimator
 from touchcell.perception.models.preprocessing import Preprocessing
 from touchcell.perception.runtime.contact_gate import ContactGate
 from touchcell.perception.runtime.estimate import ContactEstimate
 from touchcell.perception.runtime.filter_spec import ContactFilter
+from touchcell.perception.runtime.frame_stage import Frames, FrameStage, Seen, ThreadedStage
 from touchcell.perception.runtime.motion import PoseHistory
 from touchcell.perception.runtime.zero import ZeroFrame
 
@@ -108,18 +107,15 @@ class ContactPipeline:
         features: FeatureModel | None = None,
         timer: Timer = time.perf_counter_ns,
     ) -> None:
-        self._camera = camera
-        self._model = model
-        self._contact_gate = contact_gate
+        self._stage = FrameStage(camera, model, contact_gate, zero, features, timer)
+        self._frames: Frames = self._stage
+        self._thread: ThreadedStage | None = None
         self._filter = pose_filter
-        self._zero = zero
-        self._features = features
         self._timer = timer
         self._poses = PoseHistory()
         self._newest: ContactEstimate | None = None
         self._ended = False
         self._filtering = False
-        self._reduced: ImageArray | None = None
         self.measurement: Measurement | None = None
         self.frame: Stamped[Frame] | None = None
         self.times = StageTimes()
@@ -132,7 +128,7 @@ class ContactPipeline:
     @property
     def preprocessing(self) -> Preprocessing:
         """The model's preprocessing, from camera images."""
-        return self._model.header.preprocessing
+        return self._stage.preprocessing
 
     def await_frame(self) -> None:
         """Wait for the camera's first frame, which the next update processes, and compare it with the model's.
@@ -142,20 +138,31 @@ class ContactPipeline:
             CameraError: the sensor or its camera is not the model's.
             ImageError: the camera's images do not match the model.
         """
-        with suppress(EndOfStream):
-            frame = self._camera.latest()
-            if self._zero is not None and self._contact_gate is not None:
-                zeroed = self._zero(frame.value.image, self._model, self._contact_gate)
-                self._model, self._contact_gate = zeroed.estimator, zeroed.gate
+        self._stage.await_frame()
+
+    def begin_thread(self, name: str) -> None:
+        """Read frames and run the network in a thread of that name from now on, until ``end_thread``.
+
+        Filter and motion stay with the caller of ``update``. The camera must run in real time; nothing else may read
+        its frames. Raises DeviceError, ImageError for the first frame.
+        """
+        thread = ThreadedStage(self._stage, name)
+        thread.start()
+        self._frames = self._thread = thread
+
+    def end_thread(self) -> None:
+        """End the thread, if there is one; what comes after is processed in the thread of ``update``."""
+        if self._thread is not None:
+            self._thread.finish()
+            self._frames, self._thread = self._stage, None
 
     def take_zero(self) -> bool:
         """Let the contact gate compare with the newest frame from now on; False without a gate, or before a frame.
 
         The filter begins anew: what it knew was of a contact that is no more.
         """
-        if self._contact_gate is None or self._reduced is None:
+        if not self._frames.take_zero():
             return False
-        self._contact_gate.take_zero(self._reduced)
         if self._filter is not None:
             self._filter.reset()
             self._filtering = False
@@ -166,7 +173,7 @@ class ContactPipeline:
         self._poses.record(t_ns, T_base_sensor)
 
     def update(self, now_ns: int) -> ContactEstimate | None:
-        """Process the newest frame if it is new, then propagate the estimate by the sensor's motion to ``now_ns``.
+        """Process what is new, then propagate the estimate by the sensor's motion to ``now_ns``.
 
         Raises:
             DeviceError: from the camera, except EndOfStream, which sets ``ended``.
@@ -174,39 +181,26 @@ class ContactPipeline:
         """
         self.times = StageTimes()
         self.measurement = None
-        start = self._timer()
-        try:
-            frame = self._camera.latest()
-        except EndOfStream:
+        new = self._frames.new()
+        for seen in new:
+            self.frame = seen.frame
+            self._newest = self._fused(seen)
+        if self._frames.ended and not new:
             self._ended = True
             return self._newest
-        read_ns = self._timer() - start
-        # The filter cannot go back in time, so a frame older than the newest is dropped.
-        if self._newest is None or frame.t_ns > self._newest.t_frame_ns:
-            self.frame = frame
-            self._newest = self._process(frame, read_ns)
-        return self._replayed(self._newest, now_ns)
+        return None if self._newest is None else self._replayed(self._newest, now_ns)
 
-    def _process(self, frame: Stamped[Frame], read_ns: int) -> ContactEstimate:
-        start = self._timer()
-        reduced = self._reduced = self._model.reduce(frame.value.image)
-        in_contact = self._contact_gate is None or self._contact_gate.update(reduced)
-        change = None if self._contact_gate is None else self._contact_gate.score
-        preprocess_ns = self._timer() - start
-        if not in_contact:
-            self.times = StageTimes(read_ns, preprocess_ns)
+    def _fused(self, seen: Seen) -> ContactEstimate:
+        frame, prediction = seen.frame, seen.prediction
+        if prediction is None:
+            self.times = StageTimes(seen.read_ns, seen.preprocess_ns)
             self.measurement = Measurement(frame.seq, frame.t_ns, None)
             if self._filter is not None:
                 self._filter.reset()
                 self._filtering = False
-            touched = None if self._features is None else NOTHING
-            return ContactEstimate(False, None, frame.t_ns, frame.seq, frame.t_ns, change=change, touched=touched)
-        start = self._timer()
-        prediction = self._model.predict_reduced(reduced)
-        touched = None
-        if self._features is not None and prediction.displacements is not None:
-            touched = self._features.touched(prediction.displacements)
-        infer_ns = self._timer() - start
+            return ContactEstimate(
+                False, None, frame.t_ns, frame.seq, frame.t_ns, change=seen.change, touched=seen.touched
+            )
         start = self._timer()
         observed = gaussian.from_exponential(prediction.xi, prediction.covariance)
         self.measurement = Measurement(frame.seq, frame.t_ns, observed)
@@ -219,7 +213,7 @@ class ContactPipeline:
                 belief, nis = state.belief, state.nis
             elif self._filtering:
                 belief = self._filter.predict(T_base_sensor, frame.t_ns)
-        self.times = StageTimes(read_ns, preprocess_ns, infer_ns, self._timer() - start)
+        self.times = StageTimes(seen.read_ns, seen.preprocess_ns, seen.infer_ns, self._timer() - start)
         return ContactEstimate(
             True,
             belief,
@@ -231,8 +225,8 @@ class ContactPipeline:
             markers=prediction.markers,
             measured=observed,
             refusal=prediction.refusal,
-            change=change,
-            touched=touched,
+            change=seen.change,
+            touched=seen.touched,
         )
 
     def _replayed(self, estimate: ContactEstimate, now_ns: int) -> ContactEstimate:

@@ -244,5 +244,8 @@ class SlipAwareConfig(FilterConfig):
 
 
 SLIP_AWARE: Final = FilterSpec(
-    "slip_aware", "filter of a surface that stands still, along which the skin may slip", SlipAwareConfig
+    "slip_aware",
+    "filter of a surface that stands still, along which the skin may slip",
+    SlipAwareConfig,
+    anchored=True,
 )
