@@ -539,7 +539,7 @@ class ServoTask(MachineTask):
         for servo in self._servos:
             V_tcp: Array | None
             if searching and not servo.touches:
-                V_tcp = servo.along_z(1e-3 * self._config.approach_speed_mm_s)
+                V_tcp = servo.search(1e-3 * self._config.approach_speed_mm_s)
             elif (searching and self._unchecked and servo.is_estimated) or servo.only_touches:
                 V_tcp = None
             else:
