@@ -324,6 +324,11 @@ class ContactServo:
         """True if a contact has not changed however far the sensor moved on, nor let go as it was withdrawn."""
         return self.in_contact and self._letting_go_m() > 1e-3 * _LONGEST_LETTING_GO_MM
 
+    @property
+    def carries(self) -> bool:
+        """True if a contact in this approach did not change while the sensor moved on: an object is carried along."""
+        return self._letting_go is not None or self._lets_go
+
     def search(self, speed_m_s: float) -> Array:
         """Return the twist (6,) of the tool that searches along the sensor's z axis for a contact.
 

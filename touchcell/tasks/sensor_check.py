@@ -5,9 +5,9 @@ Servoing on them, the arm runs away: every correction enlarges the error. Only m
 on, then shifted and tilted by amounts that any surface bears, along one axis after the other, and the estimates of
 single frames are regressed on the motion of the arm: answer = a motion + b conj(motion) + c + d t + e t^2, for shear
 and tilt as complex numbers. While the sensor is shifted there and back it is tilted to either side: what shear does to
-an estimate of tilt, as much as the tilt itself where a tip is touched 20 deg beside its axis, is told from its answer. A right sensor has a near 1 and b near 0; the angle of a is that of a turned camera; in a
-mirror b takes its place. The depth alone is the same however the camera is turned: it is held, so that a surface that
-rises or sinks is followed.
+an estimate of tilt, as much as the tilt itself where a tip is touched 20 deg beside its axis, is told from its answer.
+A right sensor has a near 1 and b near 0; the angle of a is that of a turned camera; in a mirror b takes its place. The
+depth alone is the same however the camera is turned: it is held, so that a surface that rises or sinks is followed.
 """
 
 from __future__ import annotations
@@ -271,7 +271,7 @@ def _pooled(answers: list[Answer]) -> Answer:
 
 
 def _regressed(moved: Array, measured: Array, t_s: Array, beside: Array | None = None) -> Answer:
-    """Regress measured motions (n, 2) in a plane on those of the arm, and on others ``beside`` them if there are any."""
+    """Regress measured motions (n, 2) in a plane on those of the arm, and on any others ``beside`` them."""
     x, y = (each @ np.array([1.0, 1.0j]) for each in (moved, measured))
     others = [] if beside is None else [beside @ np.array([1.0, 1.0j]), beside @ np.array([1.0, -1.0j])]
     terms = np.column_stack([x, x.conj(), *others, np.ones(len(x)), t_s, t_s * t_s])
