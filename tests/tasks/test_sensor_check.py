@@ -7,7 +7,7 @@ import pytest
 
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
-from touchcell.tasks.sensor_check import SensorCheck
+from touchcell.tasks.sensor_check import SensorCheck, sheared_for, turned_at
 
 PERIOD_S = 0.01
 NOISE = np.array([5e-5, 5e-5, 5e-5, 0.007, 0.007, 0.01])
@@ -192,3 +192,17 @@ def test_motion_ends_where_it_began_but_for_the_press(inward: float) -> None:
         turned_deg = max(turned_deg, float(np.degrees(np.linalg.norm(se3.log(T_b_s)[3:]))))
     assert se3.log(T_b_s) == pytest.approx([0.0, 0.0, 5e-4, 0.0, 0.0, 0.0], abs=1e-4)
     assert turned_deg > 0.8
+
+
+def test_what_check_foresees_of_its_motion_is_what_it_does() -> None:
+    check, T_b_s = SensorCheck(1.0, press_mm=0.5, shift_mm=0.3, tilt_deg=1.0), np.eye(4)
+    turns_deg_s, shifts_mm = [], []
+    while not check.finished:
+        V = check.step(1e-3, T_b_s)
+        T_b_s = se3.compose(T_b_s, se3.exp(1e-3 * V))
+        turns_deg_s.append(np.degrees(np.linalg.norm(V[3:])))
+        shifts_mm.append(1e3 * float(np.linalg.norm(T_b_s[:2, 3])))
+    assert max(turns_deg_s) == pytest.approx(turned_at(1.0, 1.0), rel=0.02)
+    first_mm = np.array(shifts_mm[: round(1e3 * (0.15 + 0.425))])
+    for shear_mm, lasts_s in sheared_for(1.0, 0.3):
+        assert 1e-3 * np.count_nonzero(first_mm > shear_mm) == pytest.approx(lasts_s, rel=0.1)
