@@ -34,13 +34,13 @@ _SURE = 2.5
 _MIRROR_RATIO = 2.0
 _MOST_TURN_DEG = 30.0
 _OPPOSITE_DEG = 90.0
-_PRESS_SHARE = 0.15
+_PRESS_SHARE = 0.075
 _BACK_PER_S = 10.0
 _BACK_PER_S2 = 25.0
 _MOST_DRAG_M_S = 2e-3
 _BACK_S = 0.2
 _SHARES = (0.95, 0.75, 0.5, 0.25)
-_BEHIND_M, _BEHIND_RAD = 0.1e-3, math.radians(0.4)
+_BEHIND_M, _BEHIND_RAD = 0.1e-3, math.radians(0.2)
 # By proportional control of a measurement that is a frame old and more.
 _DEPTH_PER_S = 5.0
 _MOST_FOLLOW_M_S = 10e-3

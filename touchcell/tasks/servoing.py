@@ -84,7 +84,7 @@ class ServoConfig(ContactServoConfig):
     back_off_mm: PositiveFloat = 2.0
     approach_speed_mm_s: Annotated[PositiveFloat, SPEED] = 10.0
     approach_distance_mm: PositiveFloat = 50.0
-    check_s: NonNegativeFloat = 1.0
+    check_s: NonNegativeFloat = 2.0
     check_press_mm: Annotated[NonNegativeFloat, DEPTH] = 0.5
     check_shift_mm: Annotated[PositiveFloat, Field(le=5.0)] = 0.3
     check_tilt_deg: PositiveFloat = 1.0
