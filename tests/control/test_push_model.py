@@ -6,8 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from touchcell.control.push_model import Contact, PushEstimator, PushModel, half_between
-from touchcell.control.push_steering import Pose, steer
+from touchcell.control.push_steering import Plan, Pose, steer
 
+NO_PLAN = Plan(0.0, 0.0, math.inf)
 # Friction radii from a disc's, two thirds of the reach, to that of an oblong box pushed at its long side.
 MODELS = st.builds(
     lambda reach_m, offset, lever: PushModel(reach_m, offset * reach_m, (lever * reach_m) ** 2),
@@ -83,9 +84,8 @@ def test_an_object_that_is_steered_arrives(
     model: PushModel, aside_m: float, heading_rad: float, goal_rad: float | None
 ) -> None:
     model = PushModel(model.reach_m, 0.3 * model.offset_m, model.lever_m2)
-    thing, target, kept = PushedObject(model, heading_rad), (0.3, aside_m), 0.0
-    while (plan := steer(thing.center, model, target, goal_rad, 10.0, kept)).remaining_m > 0.0:
-        kept = plan.curvature
+    thing, target, plan = PushedObject(model, heading_rad), (0.3, aside_m), NO_PLAN
+    while (plan := steer(thing.center, model, target, goal_rad, 10.0, plan)).remaining_m > 0.0:
         motion = model.motion(0.1, plan.curvature)
         thing.push(motion.contact_ahead_m_s, motion.contact_left_m_s, 0.01)
     assert math.hypot(thing.center.x - target[0], thing.center.y - target[1]) < 2e-3
@@ -93,11 +93,24 @@ def test_an_object_that_is_steered_arrives(
         assert thing.center.heading == pytest.approx(goal_rad, abs=math.radians(2.0))
 
 
+@pytest.mark.parametrize("reach_m", [0.03, 0.04])
+def test_the_last_centimetre_is_steered_by_the_plan_and_not_by_what_its_frames_read(reach_m: float) -> None:
+    model = PushModel(reach_m, 0.0, (0.85 * reach_m) ** 2)
+    thing, target, plan = PushedObject(model), (0.06, 1e-3), NO_PLAN
+    rng = np.random.default_rng(0)
+    while plan.remaining_m > 0.0:
+        read = thing.center.heading + rng.normal(0.0, math.radians(1.0 if plan.remaining_m < 0.012 else 0.0))
+        plan = steer(Pose(thing.center.x, thing.center.y, read), model, target, None, 10.0, plan)
+        motion = model.motion(0.03, plan.curvature)
+        thing.push(motion.contact_ahead_m_s, motion.contact_left_m_s, 0.01)
+    assert abs(thing.center.y - target[1]) < 0.2e-3
+
+
 def test_a_target_beyond_the_friction_cone_is_told_to_be_missed() -> None:
     model = PushModel(0.04, 0.0, 9e-4)
-    near = steer(Pose(0.0, 0.0, 0.0), model, (0.3, 0.02), None, 0.8)
+    near = steer(Pose(0.0, 0.0, 0.0), model, (0.3, 0.02), None, 0.8, NO_PLAN)
     assert near.miss_m == 0.0
-    beside = steer(Pose(0.0, 0.0, 0.0), model, (0.05, 0.3), None, 0.1)
+    beside = steer(Pose(0.0, 0.0, 0.0), model, (0.05, 0.3), None, 0.1, NO_PLAN)
     assert beside.miss_m > 0.1
     lowest, highest = model.curvatures(0.1)
     assert lowest <= beside.curvature <= highest

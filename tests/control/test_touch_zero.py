@@ -84,3 +84,23 @@ def test_the_change_per_depth_is_that_of_the_image_and_not_of_the_model(at_m: fl
     zero = TouchZero()
     approach(zero, at_m, read, 0.0, late_ms * 1_000_000, 3.5e-3)
     assert zero.change_per_m == pytest.approx(90.0, rel=0.05)
+
+
+def test_what_shear_changes_of_the_image_counts_for_no_depth() -> None:
+    """The check after first touch presses on, and shifts the sensor there and back, before it rests."""
+    zero, read_m = TouchZero(), -0.3e-3
+    advance_m, aside_m = 0.0, 0.0
+    for seq in range(60):
+        for step in range(3):
+            if seq < 20:
+                advance_m += 10e-3 * 1e-9 * STEP_NS
+            elif seq < 40:
+                advance_m += 0.5e-3 * 1e-9 * STEP_NS
+                aside_m += (3e-3 if seq < 30 else -3e-3) * 1e-9 * STEP_NS
+            T = np.eye(4)
+            T[0, 3], T[2, 3] = aside_m, advance_m
+            zero.moved((3 * seq + step) * STEP_NS, T)
+        depth_m = max(advance_m - 5.4e-3, 0.0)
+        change = 100.0 * depth_m + (60.0 * aside_m if depth_m else 0.0)
+        zero.saw((3 * seq + 2) * STEP_NS, seq, change, contact(depth_m + read_m) if depth_m > 0.4e-3 else None)
+    assert zero.error_m == pytest.approx(read_m, abs=0.05e-3)

@@ -41,6 +41,7 @@ class KinematicPlant:
         image: difference of the image in free air from the gate's first reference; None for a plant without images.
             A depth of 1 mm changes it by 0.1.
         knocked: further difference, as of a camera that has been moved.
+        gives_way_mm: depth from which the surface moves on with the sensor.
         zeros: how often a zero frame was taken.
     """
 
@@ -60,6 +61,7 @@ class KinematicPlant:
         self.force_n: Callable[[float], float] | None = None
         self.image: float | None = None
         self.knocked = 0.0
+        self.gives_way_mm = np.inf
         self.zeros = 0
         self._zero = 0.0
         self.twist = np.zeros(6)
@@ -86,6 +88,9 @@ class KinematicPlant:
         T_w_tcp = se3.compose(self.T_w_s, se3.inverse(T_TCP_SENSOR))
         self.T_w_s = se3.compose(se3.compose(T_w_tcp, se3.exp(self.twist * DT)), T_TCP_SENSOR)
         self.T_w_f = se3.compose(self.T_w_f, se3.exp(self.velocity * DT))
+        beyond_m = float(self.sensor_in_surface()[2, 3]) - 1e-3 * self.gives_way_mm
+        if beyond_m > 0.0:
+            self.T_w_f = se3.compose(self.T_w_f, se3.exp([0.0, 0.0, beyond_m, 0.0, 0.0, 0.0]))
         return action
 
     def run(self, task: Task, until: str | None = None, limit_s: float = 60.0) -> list[Action]:

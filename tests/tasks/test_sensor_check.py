@@ -7,7 +7,7 @@ import pytest
 
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
-from touchcell.tasks.sensor_check import SensorCheck
+from touchcell.tasks.sensor_check import SensorCheck, sheared_for, turned_at
 
 PERIOD_S = 0.01
 NOISE = np.array([5e-5, 5e-5, 5e-5, 0.007, 0.007, 0.01])
@@ -60,7 +60,7 @@ def _checked(
     """Return the verdict, see there, and the true depth of each cycle, in mm."""
     depths_mm = []
     rng = np.random.default_rng(seed)
-    check = SensorCheck(1.0, press_mm=0.5, shift_mm=0.3, tilt_deg=1.0)
+    check = SensorCheck(2.0, press_mm=0.5, shift_mm=0.3, tilt_deg=1.0)
     T_b_s = se3.from_euler_mm_deg(np.array([100.0, 0.0, 50.0, 180.0, 0.0, 30.0]))
     T_b_f = se3.compose(T_b_s, se3.from_euler_mm_deg(np.array([0.2, 0.1, -0.5, 3.0, -5.0, 2.0])))
     cycle = 0
@@ -107,6 +107,17 @@ def test_mirrored_camera_is_named(turn_deg: float) -> None:
 def test_model_of_another_convention_is_named() -> None:
     """The shear of one public data set has the opposite sign of the other's; the tilt has not."""
     assert _verdict(np.diag([-1.0, -1.0, 1.0, 1.0, 1.0, -1.0])).startswith("another model")
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+@pytest.mark.parametrize("seed", range(3))
+def test_tilt_that_answers_the_shear_as_well_is_told_from_a_mirror(sign: float, seed: int) -> None:
+    """Beside its axis a tip that a network has not learnt is read 2 deg wrong where it is shifted by 0.3 mm."""
+    seen_as = np.eye(6)
+    seen_as[3, 0], seen_as[4, 1] = sign * np.radians(2.0) / 0.3e-3, -sign * np.radians(2.0) / 0.3e-3
+    assert _verdict(seen_as, seed=seed) == ""
+    assert _verdict(_mirror() @ seen_as, seed=seed).startswith("camera mirrored")
+    assert _verdict(_turn(180.0) @ seen_as, seed=seed).startswith("camera turned by about")
 
 
 def test_estimates_that_follow_nothing_are_those_of_another_model() -> None:
@@ -163,7 +174,7 @@ def test_model_of_which_one_part_is_mirrored_is_named(part: str) -> None:
 
 
 def test_too_few_estimates_are_no_agreement() -> None:
-    check = SensorCheck(1.0, press_mm=0.5, shift_mm=0.3, tilt_deg=1.0)
+    check = SensorCheck(2.0, press_mm=0.5, shift_mm=0.3, tilt_deg=1.0)
     T_b_s = np.eye(4)
     while not check.finished:
         T_b_s = se3.compose(T_b_s, se3.exp(PERIOD_S * check.step(PERIOD_S, T_b_s)))
@@ -173,11 +184,28 @@ def test_too_few_estimates_are_no_agreement() -> None:
 @pytest.mark.parametrize("inward", [1.0, 0.25])
 def test_motion_ends_where_it_began_but_for_the_press(inward: float) -> None:
     """Also of an arm that an interlock slows in one direction."""
-    check, T_b_s = SensorCheck(1.0, press_mm=0.5, shift_mm=0.3, tilt_deg=1.0), np.eye(4)
+    check, T_b_s = SensorCheck(2.0, press_mm=0.5, shift_mm=0.3, tilt_deg=1.0), np.eye(4)
     turned_deg = 0.0
     while not check.finished:
         V = check.step(PERIOD_S, T_b_s)
         T_b_s = se3.compose(T_b_s, se3.exp(PERIOD_S * (inward if V[0] > 0.0 else 1.0) * V))
         turned_deg = max(turned_deg, float(np.degrees(np.linalg.norm(se3.log(T_b_s)[3:]))))
-    assert se3.log(T_b_s) == pytest.approx([0.0, 0.0, 5e-4, 0.0, 0.0, 0.0], abs=1e-4)
+    ends = se3.log(T_b_s)
+    assert ends[:3] == pytest.approx([0.0, 0.0, 5e-4], abs=1e-4)
+    # It waits for an arm that is behind by more than this.
+    assert np.degrees(np.linalg.norm(ends[3:])) < (0.2 if inward < 1.0 else 0.01)
     assert turned_deg > 0.8
+
+
+def test_what_check_foresees_of_its_motion_is_what_it_does() -> None:
+    check, T_b_s = SensorCheck(2.0, press_mm=0.5, shift_mm=0.3, tilt_deg=1.0), np.eye(4)
+    turns_deg_s, shifts_mm = [], []
+    while not check.finished:
+        V = check.step(1e-3, T_b_s)
+        T_b_s = se3.compose(T_b_s, se3.exp(1e-3 * V))
+        turns_deg_s.append(np.degrees(np.linalg.norm(V[3:])))
+        shifts_mm.append(1e3 * float(np.linalg.norm(T_b_s[:2, 3])))
+    assert max(turns_deg_s) == pytest.approx(turned_at(2.0, 1.0), rel=0.02)
+    first_mm = np.array(shifts_mm[: round(1e3 * (0.15 + 0.925))])
+    for shear_mm, lasts_s in sheared_for(2.0, 0.3):
+        assert 1e-3 * np.count_nonzero(first_mm > shear_mm) == pytest.approx(lasts_s, rel=0.1)

@@ -289,6 +289,16 @@ def test_an_image_that_changes_without_touch_and_then_stays_trips() -> None:
     assert plant.seen[2, 3] < -0.005
 
 
+def test_a_light_object_that_is_carried_along_is_told_from_a_phantom_by_letting_go_of_it() -> None:
+    plant, task = KinematicPlant(gap_mm=5.0), build()
+    plant.image, plant.gives_way_mm = 0.0, 0.45
+    plant.run(task, until="settle")
+    assert task.state == "settle"
+    assert 0.4e-3 < plant.seen[2, 3] < 0.5e-3
+    carried_mm = 1e3 * float((plant.T_w_f[:3, 3] - KinematicPlant(gap_mm=5.0).T_w_f[:3, 3]) @ plant.T_w_f[:3, 2])
+    assert 2.0 < carried_mm < 3.5
+
+
 def test_every_transition_can_be_made_and_no_other():
     assert every_way() == expected_rows()
 

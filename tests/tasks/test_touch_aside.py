@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.helpers.kinematic_plant import CONTEXT, T_TCP_SENSOR
+from tests.helpers.kinematic_plant import CONTEXT, T_TCP_SENSOR, KinematicPlant
 from touchcell.drivers.core.samples import Stamped, TcpState
 from touchcell.geometry import se3
 from touchcell.geometry.gaussian import PoseGaussian
@@ -13,6 +13,7 @@ from touchcell.perception.runtime.estimate import ContactEstimate
 from touchcell.tasks.contact_servo import ContactServo, ContactServoConfig
 from touchcell.tasks.free_motion import Goal
 from touchcell.tasks.interface import Observation
+from touchcell.tasks.servoing import ServoConfig, ServoTask
 
 CONFIG = ContactServoConfig(kp_per_s=(0.0,) * 6, ki_per_s2=(0.0,) * 6)
 T_S_F = se3.from_euler_mm_deg(np.array([0.0, 0.0, -0.5, 0.0, 0.0, 0.0]))
@@ -76,3 +77,27 @@ def test_a_touch_that_is_as_sure_as_the_first_contact_tells_where_it_is(first_de
 def test_a_touch_far_beside_the_axis_of_the_tip_tells_nothing(first_deg, sigma_deg):
     """Where the normal's standard deviation is larger it may be any: 12 deg were read of 31, and 2 of 41."""
     assert felt(first_deg, sigma_deg) is None
+
+
+class LettingGoOnce(Feeling):
+    """A behaviour that lets go of the object once, to touch it again at the same place, and then has finished."""
+
+    def update(self, dt_s, before, now, T_s_f):
+        return not self.wants_sidestep
+
+    def next_goal(self, T_base_sensor, T_s_f):
+        self.told.append(T_s_f)
+        self.wants_sidestep = False
+        back = se3.from_euler_mm_deg(np.array([0.0, 0.0, -5.0, 0.0, 0.0, 0.0]))
+        return Goal(se3.compose(T_base_sensor, back)) if len(self.told) == 1 else None
+
+
+@pytest.mark.parametrize(("gives_way_mm", "ends"), [(np.inf, "done"), (0.45, "failed")])
+def test_an_object_that_was_felt_and_is_then_carried_along_is_not_where_it_was_felt(gives_way_mm, ends):
+    config = ServoConfig(kp_per_s=(0.0,) * 6, ki_per_s2=(0.0,) * 6, check_s=0.0)
+    servo = ContactServo("arm", "sensor", config, (0.0,) * 6, LettingGoOnce(), CONTEXT)
+    plant, task = KinematicPlant(), ServoTask("feel", config, CONTEXT, servo)
+    plant.image, plant.gives_way_mm = 0.0, gives_way_mm
+    plant.run(task)
+    assert task.state == ends
+    assert ends == "done" or "carries the object along" in task.transitions[-2].reason

@@ -12,6 +12,10 @@ arrive, the one with the least integral of ``k^2`` has a curvature linear in ``x
 worth the curvature: so near, it would follow the noise of the contact. It is planned anew in each cycle:
 model-predictive control (linear dynamics, quadratic cost, a terminal constraint) in closed form. The friction cone
 bounds the curvature.
+
+Where the heading is free, that curvature is the way that is left less ``d``, times a slope that stays the same while
+all goes as planned. Most of what moves the centre aside is done in the last centimetre, the other way round, where one
+frame's normal would change it by too much: there the plan that was made before is carried out.
 """
 
 from __future__ import annotations
@@ -24,7 +28,7 @@ from touchcell.control.path import Point
 from touchcell.control.push_model import PushModel
 
 _SHORTEST_M: Final = 0.012
-"""Way below which the object goes straight: noise would prevail, and each turn swings its centre aside."""
+"""Way below which nothing is planned anew: noise would prevail, and each turn swings its centre aside."""
 _CALM_M: Final = 0.012
 """The length r."""
 
@@ -58,12 +62,14 @@ class Plan:
         wanted: the same without that limit.
         remaining_m: way to the target.
         miss_m: by how much the target will be missed, because the friction cone does not allow what is wanted.
+        slope: of the wanted curvature over the way, 1/m^2, where the heading at the target is free.
     """
 
     curvature: float
     wanted: float
     remaining_m: float
     miss_m: float = 0.0
+    slope: float = 0.0
 
     @property
     def limited(self) -> bool:
@@ -72,7 +78,7 @@ class Plan:
 
 
 def steer(
-    center: Pose, model: PushModel, target: Point, goal_heading: float | None, friction: float, kept: float = 0.0
+    center: Pose, model: PushModel, target: Point, goal_heading: float | None, friction: float, before: Plan
 ) -> Plan:
     """Return the plan that takes an object's centre to the target.
 
@@ -82,8 +88,8 @@ def steer(
         target: where the object's middle is to arrive.
         goal_heading: of the contact normal there, rad; None where it is free.
         friction: slope of the friction cone that may be used.
-        kept: curvature where the target is too near to steer.
-        kept: curvature where the target is too near to steer.
+        before: the plan so far, whose slope or, where a heading is asked for, curvature counts where the target is too
+            near to plan anew.
     """
     lowest, highest = model.curvatures(friction)
     # The centre, moving as the unicycle does: parallel to it while the path is straight, and swinging behind it.
@@ -93,10 +99,13 @@ def steer(
     beside = Pose(*target, center.heading).ahead(model.eccentricity_m, 0.5 * math.pi)
     ahead, left = moving.local((beside.x, beside.y))
     length, swing = math.hypot(ahead, left), model.lead_m * math.cos(model.drift_rad)
-    if ahead < _SHORTEST_M:
-        wanted = kept
-    elif goal_heading is None:
-        wanted = 3.0 * left * (length - swing) / ((length - swing) ** 3 + swing**3 + _CALM_M**3)
+    slope = before.slope
+    if goal_heading is None:
+        if ahead > _SHORTEST_M:
+            slope = 3.0 * left / ((length - swing) ** 3 + swing**3 + _CALM_M**3)
+        wanted = slope * (max(ahead, 0.0) - swing if ahead < _SHORTEST_M else length - swing)
+    elif ahead < _SHORTEST_M:
+        wanted = before.curvature
     else:
         turn = math.remainder(goal_heading - center.heading, 2.0 * math.pi)
         wanted = turn / length + 6.0 * (left - (0.5 * length - swing) * turn) / length**2
@@ -105,4 +114,4 @@ def steer(
     miss_m = 0.0
     if wanted != allowed:
         miss_m = math.hypot(left, swing) * abs(wanted - allowed) / max(abs(wanted), abs(allowed))
-    return Plan(allowed, wanted, ahead, miss_m)
+    return Plan(allowed, wanted, ahead, miss_m, slope)

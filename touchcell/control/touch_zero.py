@@ -29,6 +29,8 @@ _NOW: Final = 4
 """Last poses that tell whether the sensor still moves ..."""
 _EVEN: Final = 0.8
 """... as fast as before."""
+_ALONG: Final = 0.9
+"""Share of a motion that is along the sensor's axis if it is an approach."""
 _MOST_TURN: Final = 0.9998
 """Cosine of the turn (1.1 deg) up to which the sensor's motion is a straight one."""
 _HISTORY_NS: Final = 200_000_000
@@ -81,8 +83,9 @@ class TouchZero:
         elif _FIRST_CHANGE < change < LAST_CHANGE:
             advance_m, speed_m_s, now_m_s = self._advance_m(t_frame_ns), self._speed_m_s(0), self._speed_m_s(-_NOW)
             if speed_m_s > _AT_REST_M_S:
-                # Not while it slows down: frames that are late would then show less than there is.
-                if now_m_s > _EVEN * speed_m_s:
+                # Not while it slows down: frames that are late would then show less than there is. Nor while it is
+                # shifted aside: shear changes the image as much as depth does.
+                if now_m_s > _EVEN * speed_m_s and self._advances(now_m_s):
                     self._moving.append((advance_m, change))
             elif T_s_f is not None and len(self._moving) >= _FEWEST:
                 self._conclude(advance_m, change, T_s_f)
@@ -120,6 +123,12 @@ class TouchZero:
         """Return the mean speed since one of the poses that were noted."""
         (then_ns, then), (now_ns, now) = self._poses[max(since, -len(self._poses))], self._poses[-1]
         return float(np.linalg.norm(now[:3, 3] - then[:3, 3])) / max(1e-9 * (now_ns - then_ns), 1e-9)
+
+    def _advances(self, speed_m_s: float) -> bool:
+        """Return True if the sensor now moves along its axis, at that speed."""
+        (then_ns, then), (now_ns, now) = self._poses[-min(_NOW, len(self._poses))], self._poses[-1]
+        along_m = float((now[:3, 3] - then[:3, 3]) @ now[:3, 2])
+        return along_m > _ALONG * speed_m_s * 1e-9 * (now_ns - then_ns)
 
     def _advance_m(self, t_ns: int) -> float:
         """Return how far the sensor had moved along its axis at a time, between the poses that were noted."""

@@ -275,6 +275,8 @@ class ContactServo:
         self._V_tcp = np.zeros(6)
         self._touched = False
         self._first_touch: tuple[Array, float] | None = None
+        self._letting_go: Array | None = None
+        self._lets_go = False
         self._goal: Goal | None = None
         self._felt_s = 0.0
         self._is_clear = False
@@ -319,8 +321,33 @@ class ContactServo:
 
     @property
     def contact_is_stuck(self) -> bool:
-        """True if a contact has shown since the sensor began to move and has not changed, however far it moved."""
-        return self.in_contact and not self._touched and self._pressed_m() > 1e-3 * _LONGEST_UNCHANGED_MM
+        """True if a contact has not changed however far the sensor moved on, nor let go as it was withdrawn."""
+        return self.in_contact and self._letting_go_m() > 1e-3 * _LONGEST_LETTING_GO_MM
+
+    @property
+    def carries(self) -> bool:
+        """True if a contact in this approach did not change while the sensor moved on: an object is carried along."""
+        return self._letting_go is not None or self._lets_go
+
+    def search(self, speed_m_s: float) -> Array:
+        """Return the twist (6,) of the tool that searches along the sensor's z axis for a contact.
+
+        One that does not change while the sensor moves on may be a light object that it carries along, or none at all.
+        Withdrawn, the sensor lets go of the object, which rests.
+        """
+        if self._letting_go is None and self.in_contact and not self._touched:
+            if self._pressed_m() > 1e-3 * _LONGEST_UNCHANGED_MM:
+                self._letting_go = self.T_base_sensor
+        elif self._letting_go is not None and not self.in_contact:
+            self._letting_go, self._lets_go = None, True
+        return self.along_z(speed_m_s if self._letting_go is None else -speed_m_s)
+
+    def _letting_go_m(self) -> float:
+        """Return how far the sensor has been withdrawn since its contact was doubted."""
+        if self._letting_go is None or self.T_base_sensor is None:
+            return 0.0
+        T = self._letting_go
+        return float((T[:3, 3] - self.T_base_sensor[:3, 3]) @ T[:3, 2])
 
     def _pressed_m(self) -> float:
         """Distance by which the sensor has moved along its axis since the contact first showed."""
@@ -330,10 +357,10 @@ class ContactServo:
         return float((self.T_base_sensor[:3, 3] - T[:3, 3]) @ T[:3, 2])
 
     def _watch_touch(self) -> None:
-        """A contact is one once its image has changed as the sensor pressed on; one without images is one at once."""
+        """A contact is one once its image has changed as the sensor moved; one without images is one at once."""
         if not self.in_contact or self.contact is None:
             self._touched, self._first_touch = False, None
-        elif self.contact.change is None:
+        elif self.contact.change is None or (self._lets_go and self._letting_go is None):
             self._touched = True
         elif self._first_touch is None:
             if self.T_base_sensor is not None:
@@ -418,6 +445,7 @@ class ContactServo:
     def start_approach(self) -> None:
         """Measure the travelled distance from the current pose, from which the sensor approaches."""
         self.reset_travel()
+        self._letting_go, self._lets_go = None, False
         self._touch_zero = None if self._depth_run is None else TouchZero()
         if self.sidestepping_run is not None and self.T_base_sensor is not None:
             self.sidestepping_run.begin_approach(self.T_base_sensor)
@@ -597,6 +625,7 @@ class ContactServo:
 
 _SHORTEST_PRESS_MM = 0.3
 _LONGEST_UNCHANGED_MM = 2.5
+_LONGEST_LETTING_GO_MM = 2.5
 # The image changes by about 0.1 per millimetre of depth (``contact_gate``).
 _LEAST_CHANGE = 0.01
 _REACHED_M = 0.5e-3

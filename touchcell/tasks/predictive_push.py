@@ -41,6 +41,8 @@ _TOUCHED_AGAIN_M: Final = 0.5e-3
 """Uncertainty of the centre that a further touch adds."""
 _STEERED_M: Final = 0.05
 """Way to the target above which that is judged."""
+_SLOPE_M: Final = 0.006
+"""Way over which the slope of the planned curvature is smoothed: the end is steered by it."""
 _RESERVED: Final = 0.8
 """Share of the tip's limits that steering may use."""
 _DELAY_S: Final = 0.005
@@ -507,7 +509,9 @@ class PredictivePush:
         speed_m_s = max(self._speed_m_s, self._settings.slowest_m_s)
         largest = self._settings.accel_m_s2 * dt_s / (arm_m * speed_m_s)
         change = min(max(plan.curvature - self._plan.curvature, -largest), largest)
-        self._plan = replace(plan, curvature=self._plan.curvature + change)
+        share = min(self._speed_m_s * dt_s / _SLOPE_M, 1.0)
+        slope = self._plan.slope + share * (plan.slope - self._plan.slope)
+        self._plan = replace(plan, curvature=self._plan.curvature + change, slope=slope)
         self._accelerate(dt_s, remaining_m)
         self.motion = self._estimator.model.motion(self._speed_m_s, self._plan.curvature)
         if (scale := self._within_limits()) < 1.0:
@@ -614,9 +618,7 @@ class PredictivePush:
         left_m = self._path.length_m - along_m
         if self._has_waypoints and left_m > settings.look_ahead_m:
             target, goal = self._path.point(along_m + settings.look_ahead_m), None
-        # A follower's force changes on the way: what turns the object then is kept.
-        kept = self._plan.curvature if settings.followed or goal is not None else 0.0
-        return steer(center, model, target, goal, settings.friction, kept)
+        return steer(center, model, target, goal, settings.friction, self._plan)
 
     def _accelerate(self, dt_s: float, remaining_m: float) -> None:
         settings = self._settings

@@ -4,9 +4,10 @@ A camera that is mounted turned or mirrored, or a model of another sensor, gives
 Servoing on them, the arm runs away: every correction enlarges the error. Only motion shows it. The sensor is pressed
 on, then shifted and tilted by amounts that any surface bears, along one axis after the other, and the estimates of
 single frames are regressed on the motion of the arm: answer = a motion + b conj(motion) + c + d t + e t^2, for shear
-and tilt as complex numbers. A right sensor has a near 1 and b near 0; the angle of a is that of a turned camera; in a
-mirror b takes its place. The depth alone is the same however the camera is turned: it is held, so that a surface that
-rises or sinks is followed.
+and tilt as complex numbers. While the sensor is shifted there and back it is tilted to either side: what shear does to
+an estimate of tilt, as much as the tilt itself where a tip is touched 20 deg beside its axis, is told from its answer.
+A right sensor has a near 1 and b near 0; the angle of a is that of a turned camera; in a mirror b takes its place. The
+depth alone is the same however the camera is turned: it is held, so that a surface that rises or sinks is followed.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ _SURE = 2.5
 _MIRROR_RATIO = 2.0
 _MOST_TURN_DEG = 30.0
 _OPPOSITE_DEG = 90.0
-_PRESS_SHARE = 0.15
+_PRESS_SHARE = 0.075
 _BACK_PER_S = 10.0
 _BACK_PER_S2 = 25.0
 _MOST_DRAG_M_S = 2e-3
@@ -209,29 +210,34 @@ class SensorCheck:
     def answers(self) -> tuple[Answer, Answer]:
         """Return the regressions of shear and of tilt."""
         first = self._frames[len(self._frames) // 2]
-        moved, measured = [], []
+        moved_list, measured_list = [], []
         for _, T_base_sensor, T_s_f in self._frames:
             # The surface is static: a motion of the sensor moves it in the sensor's frame by the inverse.
-            moved.append(se3.log(se3.compose(se3.inverse(T_base_sensor), first[1])))
-            measured.append(se3.log(se3.compose(T_s_f, se3.inverse(first[2]))))
+            moved_list.append(se3.log(se3.compose(se3.inverse(T_base_sensor), first[1])))
+            measured_list.append(se3.log(se3.compose(T_s_f, se3.inverse(first[2]))))
+        moved, measured = np.array(moved_list), np.array(measured_list)
         t = np.array([each[0] for each in self._frames], dtype=np.float64) * 1e-9
+        t -= t.mean()
         return (
-            _regressed(np.array(moved)[:, :2], np.array(measured)[:, :2], t - t.mean()),
-            _regressed(np.array(moved)[:, 3:5], np.array(measured)[:, 3:5], t - t.mean()),
+            _regressed(moved[:, :2], measured[:, :2], t),
+            _regressed(moved[:, 3:5], measured[:, 3:5], t, beside=moved[:, :2]),
         )
 
     def _displacement(self, t_s: float) -> Array:
         """Return the (6,) displacement of the sensor from its start, m and rad."""
         press_s = _PRESS_SHARE * self._duration_s
         pulse_s = 0.5 * (self._duration_s - press_s)
-        first, second = (_pulse((t_s - press_s) / pulse_s - number) for number in (0, 1))
+        (first, first_turn), (second, second_turn) = (
+            (_pulse(t), _pulse(2.0 * t) - _pulse(2.0 * t - 1.0))
+            for t in ((t_s - press_s) / pulse_s - number for number in (0, 1))
+        )
         return np.array(
             [
                 self._shift_m * first,
                 self._shift_m * second,
                 self._press_m * min(t_s / press_s, 1.0),
-                self._tilt_rad * first,
-                self._tilt_rad * second,
+                self._tilt_rad * first_turn,
+                self._tilt_rad * second_turn,
                 0.0,
             ]
         )
@@ -245,7 +251,7 @@ def sheared_for(duration_s: float, shift_mm: float) -> list[tuple[float, float]]
 
 def turned_at(duration_s: float, tilt_deg: float) -> float:
     """Return the fastest tilting of a check of a duration, deg/s."""
-    return math.pi * tilt_deg / (0.5 * (1.0 - _PRESS_SHARE) * duration_s)
+    return math.pi * tilt_deg / (0.25 * (1.0 - _PRESS_SHARE) * duration_s)
 
 
 def _pulse(t: float) -> float:
@@ -264,15 +270,16 @@ def _pooled(answers: list[Answer]) -> Answer:
     return Answer(straight, mirrored, 1.0 / math.sqrt(total))
 
 
-def _regressed(moved: Array, measured: Array, t_s: Array) -> Answer:
-    """Regress measured motions (n, 2) in a plane on those of the arm."""
+def _regressed(moved: Array, measured: Array, t_s: Array, beside: Array | None = None) -> Answer:
+    """Regress measured motions (n, 2) in a plane on those of the arm, and on any others ``beside`` them."""
     x, y = (each @ np.array([1.0, 1.0j]) for each in (moved, measured))
-    terms = np.column_stack([x, x.conj(), np.ones(len(x)), t_s, t_s * t_s])
+    others = [] if beside is None else [beside @ np.array([1.0, 1.0j]), beside @ np.array([1.0, -1.0j])]
+    terms = np.column_stack([x, x.conj(), *others, np.ones(len(x)), t_s, t_s * t_s])
     gains, _, _, _ = np.linalg.lstsq(terms, y, rcond=None)
     residual = y - terms @ gains
     variance = float((np.abs(residual) ** 2).sum()) / max(len(x) - terms.shape[1], 1)
     spread = np.linalg.pinv(terms.conj().T @ terms)
     deviation = math.sqrt(max(variance * float(spread[0, 0].real), 0.0))
-    drift = terms[:, 2:] @ gains[2:]
+    drift = terms[:, -3:] @ gains[-3:]
     drift_ratio = float(np.abs(drift - drift[0]).max() / max(np.abs(x - x[0]).max(), 1e-9))
     return Answer(complex(gains[0]), complex(gains[1]), deviation, drift_ratio)

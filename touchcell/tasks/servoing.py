@@ -84,7 +84,7 @@ class ServoConfig(ContactServoConfig):
     back_off_mm: PositiveFloat = 2.0
     approach_speed_mm_s: Annotated[PositiveFloat, SPEED] = 10.0
     approach_distance_mm: PositiveFloat = 50.0
-    check_s: NonNegativeFloat = 1.0
+    check_s: NonNegativeFloat = 2.0
     check_press_mm: Annotated[NonNegativeFloat, DEPTH] = 0.5
     check_shift_mm: Annotated[PositiveFloat, Field(le=5.0)] = 0.3
     check_tilt_deg: PositiveFloat = 1.0
@@ -242,6 +242,7 @@ class ServoTask(MachineTask):
         self._steady_s = 0.0
         self._blind_s = 0.0
         self._reapproaches = 0
+        self._placed = False
         self._stop_seen = False
         self._finished_run = False
         self._prepared = _Preparation.FIRST_ZERO
@@ -299,6 +300,7 @@ class ServoTask(MachineTask):
     def start_approach(self, record: TransitionRecord) -> None:
         """On entry: measure the travelled distance from here."""
         self._reapproaches += record.event == "lost"
+        self._placed = record.event == "placed"
         for servo in self._servos:
             servo.start_approach()
         self._blind_s = 0.0
@@ -387,6 +389,8 @@ class ServoTask(MachineTask):
         searching = [servo for servo in self._servos if not servo.touches]
         if stuck := next((servo.sensor for servo in self._servos if servo.contact_is_stuck), None):
             self._post(TRIP, f"{stuck}: its contact does not change while the arm moves")
+        elif self._placed and (carrying := next((servo.sensor for servo in self._servos if servo.carries), None)):
+            self._post("no_contact", f"{carrying} carries the object along: where it is cannot be felt")
         elif not searching:
             self._post("contact")
         elif max(servo.travelled_m() for servo in searching) >= 1e-3 * self._config.approach_distance_mm:
@@ -539,7 +543,7 @@ class ServoTask(MachineTask):
         for servo in self._servos:
             V_tcp: Array | None
             if searching and not servo.touches:
-                V_tcp = servo.along_z(1e-3 * self._config.approach_speed_mm_s)
+                V_tcp = servo.search(1e-3 * self._config.approach_speed_mm_s)
             elif (searching and self._unchecked and servo.is_estimated) or servo.only_touches:
                 V_tcp = None
             else:
