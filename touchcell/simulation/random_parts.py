@@ -14,14 +14,22 @@ from touchcell.simulation.meshes.smoothing import TriangleMesh
 
 _WALL_M: Final = 25e-3
 _INWARDS_M: Final = (0.0, 2e-3, 5e-3, 9e-3, 14e-3, 20e-3, 28e-3, 40e-3)
-_OUTWARDS_M: Final = (0.0, 2e-3, 5e-3, 9e-3, 14e-3, 20e-3, 28e-3, 40e-3)
-_INNERMOST: Final = 0.15
+_OUTER: Final = 0.85
+_HOLES: Final = 0.3
+_LEANING: Final = 0.75
 _BLUNTEST_RAD: Final = math.radians(50.0)
-_SHARPEST_RAD: Final = math.radians(35.0)
+_SHARPEST_RAD: Final = math.radians(40.0)
 _DOWN_M: Final = (3e-3, 7e-3, 12e-3, 18e-3, _WALL_M)
 _WALL_PER_M: Final = 45.0
 _NARROWEST: Final = 0.15
 """Size of a part's foot, as a share of its face."""
+_SHEETS: Final = 0.25
+_SHEET_M: Final = (3e-3, 8e-3)
+_UNDERSIDE_M: Final = (5e-3, 12e-3, 25e-3)
+_RINGS: Final = 0.1
+_RING_M: Final = (4e-3, 12e-3)
+_FLAT: Final = 0.25
+_BENT: Final = 0.6
 _SHARPEST_CURVATURE_PER_M: Final = 36.0
 _STEEPEST_WAVE: Final = 0.35
 _WAVES_PER_M: Final = (45.0, 130.0)
@@ -30,39 +38,56 @@ _WAVES_PER_M: Final = (45.0, 130.0)
 def random_part(rng: np.random.Generator) -> TriangleMesh:
     """Return a part whose rim is an edge between a face above and a wall below; its face looks towards +z.
 
-    A third of the faces are flat, the others bend both ways or are waves, with radii down to 28 mm. Half of the walls
-    lean, more of them as a bowl's do, and most of these bend. Outlines are circles, waves round a circle, drops with
-    one sharp end, polygons and stars; three in ten are the rims of holes.
+    A quarter of the faces are flat, the others bend both ways or are waves, with radii down to 28 mm, so that rims lead
+    through space. Three quarters of the walls lean, so that they meet a face at 50 to 140 deg, and most of these bend,
+    as a bowl's do. Outlines are circles, waves round a circle, drops with one sharp end, polygons and stars; three in
+    ten are the rims of holes. A quarter are sheets 3 to 8 mm thick, a tenth are rings no wider than 12 mm, like the
+    rim of a cup.
     """
-    hole = bool(rng.random() < 0.3)
+    hole = bool(rng.random() < _HOLES)
     outline = _outline(rng, hole=hole)
+    length = np.linalg.norm(outline, axis=1, keepdims=True)
     heights = _random_heights(rng)
     # Walls that lean under the face are as sharp as those of thin plates; blunt ones are those of bowls.
-    lean = rng.uniform(-_BLUNTEST_RAD, _SHARPEST_RAD) * (rng.random() < 0.5)
+    lean = rng.uniform(-_BLUNTEST_RAD, _SHARPEST_RAD) * (rng.random() < _LEANING)
     wall_per_m = rng.uniform(-_WALL_PER_M, _WALL_PER_M) * (lean != 0.0 and rng.random() < 0.6)
-    down = np.array(_DOWN_M)[::-1]
-    under = (math.tan(lean) * down + 0.5 * wall_per_m * down**2)[:, None, None]
-    length = np.linalg.norm(outline, axis=1, keepdims=True)
     middle = outline[rng.integers(len(outline))]
-    if hole:
-        rings = np.stack([outline * (1.0 + away / length) for away in _OUTWARDS_M])
-        wall = outline * np.maximum(1.0 + under / length, _NARROWEST)
+    kind = rng.random()
+    sheet_m = rng.uniform(*_SHEET_M) if kind < _SHEETS else None
+    ring_m = rng.uniform(*_RING_M) if kind > 1.0 - _RINGS else None
+
+    def beside(offsets_m: Array) -> Array:
+        """Return the outline moved to the side where the face is: rows (k, n, 2) m."""
+        share = offsets_m[:, None, None] / length
+        return outline * np.maximum(1.0 + share if hole else 1.0 - share, _NARROWEST)
+
+    def on_face(rows: Array) -> Array:
+        # Bent about a point of the rim, so that it stays a height over the plane however large the part is.
+        return np.concatenate([rows, heights(rows - middle)[..., None]], axis=2)
+
+    inwards = np.array(_INWARDS_M)
+    if ring_m is not None:
+        face = on_face(beside(np.linspace(0.0, ring_m, 4)))
+    elif hole:
+        face = on_face(beside(inwards))
     else:
-        shares = 1.0 - np.array(_INWARDS_M) / max(float(length.max()), _INWARDS_M[-1] / (1.0 - _INNERMOST))
-        rings = outline * shares[:, None, None]
-        wall = outline * np.maximum(1.0 - under / length, _NARROWEST)
-    # Bent about a point of the rim, so that it stays a height over the plane however large the part is.
-    face = np.concatenate([rings, heights(rings - middle)[..., None]], axis=2)
-    below = np.concatenate([wall, face[:1, :, 2:] - down[:, None, None]], axis=2)
-    count, rows = len(outline), len(face) + len(below)
-    vertices = np.concatenate([below, face]).reshape(-1, 3)
-    faces = grid_faces(rows, count, closed=True)
-    if hole:
-        return TriangleMesh(vertices, np.ascontiguousarray(faces[:, ::-1]))
+        face = on_face(outline * (1.0 - inwards / max(float(length.max()), inwards[-1] / _OUTER))[:, None, None])
+    down = np.array(_DOWN_M) if sheet_m is None else sheet_m * np.array([0.5, 1.0])
+    under = np.tan(lean) * down + 0.5 * wall_per_m * down**2
+    rows = [np.concatenate([beside(under), face[:1, :, 2:] - down[:, None, None]], axis=2)[::-1], face]
+    if sheet_m is not None:
+        rows.insert(0, (on_face(beside(under[-1] + np.array(_UNDERSIDE_M))) - [0.0, 0.0, sheet_m])[::-1])
+    open_inside = hole or ring_m is not None
+    if open_inside:
+        rows.append(face[-1] - np.array([[[0.0, 0.0, _WALL_M]]]))
+    grid = np.concatenate(rows)
+    vertices, faces = grid.reshape(-1, 3), grid_faces(len(grid), len(outline), closed=True)
+    if open_inside:
+        return TriangleMesh(vertices, np.ascontiguousarray(faces[:, ::-1]) if hole else faces)
+    count = len(outline)
     here, there = np.arange(count), (np.arange(count) + 1) % count
-    centre_z = float(heights(-middle))
-    vertices = np.concatenate([vertices, [[0.0, 0.0, centre_z]]])
-    last = (rows - 1) * count
+    vertices = np.concatenate([vertices, [[0.0, 0.0, float(heights(-middle))]]])
+    last = (len(grid) - 1) * count
     lid = np.stack([np.full(count, len(vertices) - 1), last + here, last + there], axis=1)
     return TriangleMesh(vertices, np.concatenate([faces, lid]).astype(np.int32))
 
@@ -122,9 +147,9 @@ def _drop(rng: np.random.Generator) -> Array:
 def _random_heights(rng: np.random.Generator) -> Callable[[Array], Array]:
     """Return a function of points (..., 2) m that gives the height (...) m of a face over the plane at each."""
     kind, turns = rng.random(), rng.uniform(0.0, math.pi, 2)
-    if kind < 0.35:
+    if kind < _FLAT:
         return lambda points: np.zeros(points.shape[:-1])
-    if kind < 0.65:
+    if kind < _BENT:
         # Two bends across each other.
         curvature = rng.uniform(-_SHARPEST_CURVATURE_PER_M, _SHARPEST_CURVATURE_PER_M, 2)
         ways = _directions(turns[0] + np.array([0.0, 0.5 * math.pi]))
