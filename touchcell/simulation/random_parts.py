@@ -22,7 +22,7 @@ _SHARPEST_RAD: Final = math.radians(40.0)
 _DOWN_M: Final = (3e-3, 7e-3, 12e-3, 18e-3, _WALL_M)
 _WALL_PER_M: Final = 45.0
 _NARROWEST: Final = 0.15
-"""Size of a part's foot, as a share of its face."""
+"""Size of a part's foot, as a share of its face, about."""
 _SHEETS: Final = 0.25
 _SHEET_M: Final = (3e-3, 8e-3)
 _UNDERSIDE_M: Final = (5e-3, 12e-3, 25e-3)
@@ -58,8 +58,9 @@ def random_part(rng: np.random.Generator) -> TriangleMesh:
 
     def beside(offsets_m: Array) -> Array:
         """Return the outline moved to the side where the face is: rows (k, n, 2) m."""
-        share = offsets_m[:, None, None] / length
-        return outline * np.maximum(1.0 + share if hole else 1.0 - share, _NARROWEST)
+        share = (1.0 if hole else -1.0) * offsets_m[:, None, None] / length
+        # Never through the middle, and no two rows in one place.
+        return outline * np.where(share < 0.0, np.maximum(1.0 + share, _NARROWEST * np.exp(share)), 1.0 + share)
 
     def on_face(rows: Array) -> Array:
         # Bent about a point of the rim, so that it stays a height over the plane however large the part is.
