@@ -98,7 +98,7 @@ def way_along_edge(
     distance_m: float,
     step_m: float,
 ) -> Array | None:
-    """Return the way (n, 3), m, of a tip along the edge that it meets, until the way is long enough or closed.
+    """Return the frames {e} (n, 4, 4) along the edge that a tip meets, until the way is long enough or closed.
 
     Args:
         surfaces: what stands still.
@@ -112,14 +112,14 @@ def way_along_edge(
     T_world_e = None if met is None else nearest_edge(surfaces, met, 0.0, tip_radius_m)
     if T_world_e is None:
         return None
-    way = [T_world_e[:3, 3]]
+    way = [T_world_e]
     ahead = np.eye(4)
     ahead[:2, 3] = -_ON_FACE_M, step_m
     for _ in range(math.ceil(distance_m / abs(step_m))):
         T_world_e = nearest_edge(surfaces, se3.compose(T_world_e, ahead), 0.0, tip_radius_m)
         assert T_world_e is not None
-        way.append(T_world_e[:3, 3])
-        if len(way) > _FEWEST_OF_LOOP and float(np.linalg.norm(way[-1] - way[0])) < abs(step_m):
+        way.append(T_world_e)
+        if len(way) > _FEWEST_OF_LOOP and float(np.linalg.norm((way[-1] - way[0])[:3, 3])) < abs(step_m):
             break
     return np.array(way)
 

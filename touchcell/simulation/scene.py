@@ -555,7 +555,7 @@ class SceneConfig(Section, SceneSection):
     def way_along_edge(
         self, T_world_s: Array, distance_m: float, reach_m: float, *, backward: bool = False
     ) -> Array | None:
-        """Return the way along an edge of surfaces that stand still; None where anything moves, or no edge is met."""
+        """Return frames along an edge of surfaces that stand still; None where anything moves, or no edge is met."""
         step_m = -_RIM_STEP_M if backward else _RIM_STEP_M
         return way_along_edge(self._still(), T_world_s, 1e-3 * self.tip.radius_mm, reach_m, distance_m, step_m)
 

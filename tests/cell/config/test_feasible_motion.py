@@ -190,6 +190,12 @@ FAILING = [
         r"mm the edge leads out of interlocks.workspace, which would trip: x = -4",
     ),
     (EDGE, [("task.distance_mm", 200)], "task.distance_mm", "200 mm along the edge do not lead back"),
+    (
+        EDGE,
+        [("task.dimensions", 3), ("arms.arm.start_pose_mm_deg", [35, 0, 44, 180, 40, 0])],
+        "task.dimensions",
+        "its face leans by more than 35 deg against the tip, which stays as it starts: up to 40 deg",
+    ),
 ]
 
 

@@ -43,6 +43,8 @@ _LEAST_TOUCH_PERCENT: Final = 0.1
 """A quarter of a grey level."""
 _LIGHTEST: Final = 0.5
 """Part of the depth at which a contact ends as its image says that surely is none."""
+_MOST_TILT_RAD: Final = math.radians(35.0)
+"""Against the face beside an edge; networks are trained to 32 deg."""
 _WAY_SLACK_MM: Final = 5.0
 """By which a way over a surface may be elsewhere: the sensor turns with the surface a little late."""
 
@@ -259,11 +261,12 @@ def _along_edge(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
     if first is None:
         return
     for motion in rims:
-        way_m = first.scene.way_along_edge(
+        frames = first.scene.way_along_edge(
             first.T_world_sensor, motion.distance_m, first.reach_m, backward=motion.backward
         )
-        if way_m is None:
+        if frames is None:
             continue
+        way_m = frames[:, :3, 3]
         steps_m = np.linalg.norm(np.diff(way_m, axis=0), axis=1)
         for rule, box in _boxes(plan).items():
             if box.sensor not in plan.sensor_roles:
@@ -285,6 +288,18 @@ def _along_edge(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
                 value=1e3 * motion.distance_m,
                 hint="allow more, or leave out `close_loop`",
             )
+        if not motion.tilts and _has_model(plan):
+            cos = np.clip(frames[:, :3, 2] @ first.T_world_sensor[:3, 2], -1.0, 1.0)
+            leaning = np.flatnonzero(cos < math.cos(_MOST_TILT_RAD))
+            if leaning.size:
+                i = int(leaning[0])
+                yield file.problem(
+                    ("task", "dimensions"),
+                    f"after {1e3 * steps_m[:i].sum():.0f} mm along the edge its face leans by more than "
+                    f"{math.degrees(_MOST_TILT_RAD):.0f} deg against the tip, which stays as it starts: up to "
+                    f"{math.degrees(math.acos(float(cos.min()))):.0f} deg; no edge is read at that",
+                    hint="start with the tip upright over the part, or let it tilt: `dimensions: 5`",
+                )
 
 
 def _extent(way_m: Array) -> float:

@@ -193,9 +193,9 @@ class SceneSection(BaseModel):
     def way_along_edge(
         self, T_world_s: Array, distance_m: float, reach_m: float, *, backward: bool = False
     ) -> Array | None:
-        """Return the way (n, 3), m, of a tip that approaches along its axis and then follows the edge that it meets.
+        """Return the frames {e} (n, 4, 4) along the edge that a tip meets which approaches along its axis.
 
-        It ends where it leads back to where it began. None where it meets no edge, or what it touches moves.
+        The way ends where it leads back to where it began. None where it meets no edge, or what it touches moves.
 
         Args:
             T_world_s: (4, 4) pose of the sensor at the start.
