@@ -186,6 +186,7 @@ class SceneSection(BaseModel):
     def points_over(self, T_world_s: Array, points: Array, depth_m: float, reach_m: float) -> Array | None:
         """Return where (n, 3), m, the tip is at points (n, 2), m, of the plane of its first contact.
 
+        The result is (n, 2, 3): with each place the outward normal of the face that is touched, nan where none is.
         None where it makes no contact, or what it touches moves. The other arguments are those of ``way_over``.
         """
         return None
@@ -209,7 +210,9 @@ class SceneSection(BaseModel):
         """Return whether anything in it has an edge that could be followed."""
         return True
 
-    def start_near(self, T_world_s: Array, reach_m: float, *, on_edge: bool = False) -> Array | None:
+    def start_near(
+        self, T_world_s: Array, reach_m: float, allowed: Callable[[Array], bool], *, on_edge: bool = False
+    ) -> Array | None:
         """Return the pose (4, 4) of a sensor near that of a start, from which it comes upon something.
 
         None where the start itself will do, or no other one is known.
