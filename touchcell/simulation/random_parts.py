@@ -60,7 +60,8 @@ def random_part(rng: np.random.Generator) -> TriangleMesh:
         """Return the outline moved to the side where the face is: rows (k, n, 2) m."""
         share = (1.0 if hole else -1.0) * offsets_m[:, None, None] / length
         # Never through the middle, and no two rows in one place.
-        return outline * np.where(share < 0.0, np.maximum(1.0 + share, _NARROWEST * np.exp(share)), 1.0 + share)
+        scale: Array = np.where(share < 0.0, np.maximum(1.0 + share, _NARROWEST * np.exp(share)), 1.0 + share)
+        return outline * scale
 
     def on_face(rows: Array) -> Array:
         # Bent about a point of the rim, so that it stays a height over the plane however large the part is.

@@ -100,6 +100,12 @@ def _boxes(plan: CellPlan) -> dict[str, Any]:
     return {rule: box for rule, box in plan.cell.interlocks.items() if is_kind(box, "workspace")}
 
 
+def _cones(plan: CellPlan) -> dict[str, Any]:
+    """Return the cones that guard the axis of a sensor."""
+    rules: dict[str, Any] = dict(plan.cell.interlocks)
+    return {rule: cone for rule, cone in rules.items() if is_kind(cone, "tilt") and cone.sensor in plan.sensor_roles}
+
+
 def _ways_out(file: YamlFile, plan: CellPlan, ways: Ways) -> Iterator[ConfigError]:
     """Ways over surfaces of the scene, out of a box that the arm must not leave."""
     boxes = _boxes(plan)
@@ -309,11 +315,7 @@ def _over_border(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
     first = _first_approach(plan) if slides else None
     if first is None:
         return
-    cones = {
-        rule: cone
-        for rule, cone in plan.cell.interlocks.items()
-        if is_kind(cone, "tilt") and cone.sensor in plan.sensor_roles
-    }
+    cones = _cones(plan)
     R = first.T_world_base[:3, :3]
     for motion in slides:
         corners_m = np.array(motion.corners_m).reshape(-1, 2)

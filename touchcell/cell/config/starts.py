@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -80,7 +80,8 @@ def start_near(plan: CellPlan, scene: SceneSection, sensor: str) -> str:
 def _is_allowed(plan: CellPlan, sensor: str, T_base_s: Array) -> bool:
     """Return whether the boxes and cones that guard a sensor let it start at a pose (4, 4)."""
     at_mm = 1e3 * T_base_s[:3, 3]
-    for rule in plan.cell.interlocks.values():
+    rules: Iterable[Any] = plan.cell.interlocks.values()
+    for rule in rules:
         if plan.sensor_roles.get(getattr(rule, "sensor", None) or "") != sensor:
             continue
         if is_kind(rule, "workspace") and not ((rule.min_mm <= at_mm) & (at_mm <= rule.max_mm)).all():
