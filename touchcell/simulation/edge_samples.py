@@ -8,7 +8,7 @@ edge with the tip: its y is zero.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import islice
 from typing import Final
@@ -23,6 +23,7 @@ from touchcell.simulation.contact import ContactLaw, about_z
 from touchcell.simulation.edge_ways import contacts_on_way
 from touchcell.simulation.edges import nearest_edge
 from touchcell.simulation.meshes.mesh_shape import MeshShape
+from touchcell.simulation.meshes.smoothing import TriangleMesh
 from touchcell.simulation.pressed import pressed
 from touchcell.simulation.random_parts import random_part
 from touchcell.simulation.samples import SampledContact, Variation, scattered
@@ -99,15 +100,20 @@ class EdgeRanges:
 
 
 def edge_contacts(
-    n: int, seed: int, *, ranges: EdgeRanges | None = None, variation: Variation | None = None
+    n: int,
+    seed: int,
+    *,
+    ranges: EdgeRanges | None = None,
+    variation: Variation | None = None,
+    part: Callable[[np.random.Generator], TriangleMesh] = random_part,
 ) -> Iterator[SampledContact]:
-    """Yield ``n`` random contacts with edges, the same for the same seed."""
+    """Yield ``n`` random contacts with edges, the same for the same seed; ``part`` draws what is touched."""
     ranges, variation, law = ranges or EdgeRanges(), variation or Variation(), ContactLaw()
     for start in range(0, n, _IMAGES_PER_TIP):
         # Of its own for each part: a longer draw begins with the shorter one.
         rng = np.random.default_rng([seed, start])
         tip = Tip(scattered(TipParameters(), variation, rng))
-        shape = MeshShape(random_part(rng), _CREASE_RAD)
+        shape = MeshShape(part(rng), _CREASE_RAD)
         made = _on_ways if rng.random() < _ON_WAYS else _anywhere
         for T_e_s, pixels in islice(made(shape, tip, ranges, law, rng), min(_IMAGES_PER_TIP, n - start)):
             pixels = pixels + rng.normal(0.0, variation.marker_px, pixels.shape)

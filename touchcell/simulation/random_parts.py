@@ -30,9 +30,41 @@ _RINGS: Final = 0.1
 _RING_M: Final = (4e-3, 12e-3)
 _FLAT: Final = 0.25
 _BENT: Final = 0.6
+_STEEP_HOLES: Final = 0.45
+_STEEP_FLAT: Final = 0.3
+_STEEP_BENT: Final = 0.6
+_STEEP_CURVATURE_PER_M: Final = (6.0, 36.0)
+_STEEP_WAVES_PER_M: Final = (70.0, 135.0)
+_STEEP_SHARE: Final = (1.0, 2.3)
 _SHARPEST_CURVATURE_PER_M: Final = 36.0
 _STEEPEST_WAVE: Final = 0.35
 _WAVES_PER_M: Final = (45.0, 130.0)
+
+
+def steep_part(rng: np.random.Generator) -> TriangleMesh:
+    """Return a part of what is rare among random ones: leaning, bent walls, and faces that bend tightly both ways.
+
+    Between a third and a quarter of the faces are flat, as beside the rim of a bowl; outlines have few corners.
+    """
+    hole = bool(rng.random() < _STEEP_HOLES)
+    outline = _outline(rng, hole=hole, kind=rng.uniform(0.12, 0.6))
+    lean, wall_per_m = rng.uniform(-_BLUNTEST_RAD, _SHARPEST_RAD), rng.uniform(-_WALL_PER_M, _WALL_PER_M)
+    sheet_m = rng.uniform(*_SHEET_M) if rng.random() < _SHEETS else None
+    middle = outline[rng.integers(len(outline))]
+    return _part(outline, middle, _steep_heights(rng), lean, wall_per_m, sheet_m, None, hole=hole)
+
+
+def _steep_heights(rng: np.random.Generator) -> Callable[[Array], Array]:
+    kind, turns = rng.random(), rng.uniform(0.0, math.pi, 2)
+    if kind < _STEEP_FLAT:
+        return _flat
+    if kind < _STEEP_BENT:
+        curvature = rng.uniform(*_STEEP_CURVATURE_PER_M, 2) * rng.choice([-1.0, 1.0], 2)
+        return _bent(turns[0], curvature)
+    # Two alike across each other, as in an egg box.
+    per_m = rng.uniform(*_STEEP_WAVES_PER_M)
+    across = np.array([turns[0], turns[0] + 0.5 * math.pi])
+    return _waves(across, np.full(2, per_m), rng.uniform(*_STEEP_SHARE, 2), rng.uniform(0.0, 2.0 * math.pi, 2))
 
 
 def random_part(rng: np.random.Generator) -> TriangleMesh:
@@ -45,8 +77,7 @@ def random_part(rng: np.random.Generator) -> TriangleMesh:
     rim of a cup.
     """
     hole = bool(rng.random() < _HOLES)
-    outline = _outline(rng, hole=hole)
-    length = np.linalg.norm(outline, axis=1, keepdims=True)
+    outline = _outline(rng, hole=hole, kind=rng.random())
     heights = _random_heights(rng)
     # Walls that lean under the face are as sharp as those of thin plates; blunt ones are those of bowls.
     lean = rng.uniform(-_BLUNTEST_RAD, _SHARPEST_RAD) * (rng.random() < _LEANING)
@@ -55,6 +86,25 @@ def random_part(rng: np.random.Generator) -> TriangleMesh:
     kind = rng.random()
     sheet_m = rng.uniform(*_SHEET_M) if kind < _SHEETS else None
     ring_m = rng.uniform(*_RING_M) if kind > 1.0 - _RINGS else None
+    return _part(outline, middle, heights, lean, wall_per_m, sheet_m, ring_m, hole=hole)
+
+
+def _part(
+    outline: Array,
+    middle: Array,
+    heights: Callable[[Array], Array],
+    lean: float,
+    wall_per_m: float,
+    sheet_m: float | None,
+    ring_m: float | None,
+    *,
+    hole: bool,
+) -> TriangleMesh:
+    """Return the part with a rim over ``outline`` (n, 2) m, whose face bends about ``middle`` (2,) m.
+
+    Its wall leans by ``lean`` rad under the face and bends; it is a sheet or a ring of so many metres, if any.
+    """
+    length = np.linalg.norm(outline, axis=1, keepdims=True)
 
     def beside(offsets_m: Array) -> Array:
         """Return the outline moved to the side where the face is: rows (k, n, 2) m."""
@@ -94,10 +144,9 @@ def random_part(rng: np.random.Generator) -> TriangleMesh:
     return TriangleMesh(vertices, np.concatenate([faces, lid]).astype(np.int32))
 
 
-def _outline(rng: np.random.Generator, *, hole: bool) -> Array:
+def _outline(rng: np.random.Generator, *, hole: bool, kind: float) -> Array:
     """Return (n, 2) m, counter-clockwise and seen whole from the origin."""
     smallest = 24e-3 if hole else 16e-3
-    kind = rng.random()
     if kind < 0.12 and not hole:
         return _drop(rng)
     if kind < 0.5:
@@ -150,13 +199,20 @@ def _random_heights(rng: np.random.Generator) -> Callable[[Array], Array]:
     """Return a function of points (..., 2) m that gives the height (...) m of a face over the plane at each."""
     kind, turns = rng.random(), rng.uniform(0.0, math.pi, 2)
     if kind < _FLAT:
-        return lambda points: np.zeros(points.shape[:-1])
+        return _flat
     if kind < _BENT:
-        # Two bends across each other.
-        curvature = rng.uniform(-_SHARPEST_CURVATURE_PER_M, _SHARPEST_CURVATURE_PER_M, 2)
-        ways = _directions(turns[0] + np.array([0.0, 0.5 * math.pi]))
-        return lambda points: 0.5 * _bounded(points @ ways) @ curvature
+        return _bent(turns[0], rng.uniform(-_SHARPEST_CURVATURE_PER_M, _SHARPEST_CURVATURE_PER_M, 2))
     return random_waves(rng, turns)
+
+
+def _flat(points: Array) -> Array:
+    return np.zeros(points.shape[:-1])
+
+
+def _bent(turn: float, curvature_per_m: Array) -> Callable[[Array], Array]:
+    """Return the heights of two bends across each other, the first along ``turn`` rad."""
+    ways = _directions(turn + np.array([0.0, 0.5 * math.pi]))
+    return lambda points: 0.5 * _bounded(points @ ways) @ curvature_per_m
 
 
 def random_waves(rng: np.random.Generator, turns: Array) -> Callable[[Array], Array]:
@@ -164,9 +220,13 @@ def random_waves(rng: np.random.Generator, turns: Array) -> Callable[[Array], Ar
 
     Where they are tightest, radii are down to 14 mm where both add up and 28 mm along each.
     """
-    per_m = rng.uniform(*_WAVES_PER_M, 2)
+    per_m, share = rng.uniform(*_WAVES_PER_M, 2), rng.uniform(0.0, 2.0, 2)
+    return _waves(turns, per_m, share, rng.uniform(0.0, 2.0 * math.pi, 2))
+
+
+def _waves(turns: Array, per_m: Array, share: Array, phase: Array) -> Callable[[Array], Array]:
     highest_m = np.minimum(0.5 * _SHARPEST_CURVATURE_PER_M / per_m**2, 0.5 * _STEEPEST_WAVE / per_m)
-    amplitude_m, phase = rng.uniform(0.0, 2.0, 2) * highest_m, rng.uniform(0.0, 2.0 * math.pi, 2)
+    amplitude_m = share * highest_m
     waves = per_m * _directions(turns)
     return lambda points: np.cos(points @ waves + phase) @ amplitude_m
 

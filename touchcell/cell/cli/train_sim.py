@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -28,6 +29,7 @@ from touchcell.perception.networks.progress import Display, Observer
 from touchcell.perception.networks.training import Settings, train_on_arrays
 from touchcell.perception.runtime.estimator_spec import Feature
 from touchcell.simulation.edge_samples import edge_contacts
+from touchcell.simulation.random_parts import steep_part
 from touchcell.simulation.render import FrameRenderer
 from touchcell.simulation.samples import USUAL_VARIATION, SampledContact, Variation, contacts
 from touchcell.simulation.shape_samples import shape_contacts
@@ -80,6 +82,9 @@ DETAIL_SETTINGS: Final[dict[str, Any]] = {
 }
 """Edges and tilts are told by tenths of a pixel (docs/decisions/0051-edges-in-detail.md)."""
 
+_STEEP: Final = 2.0 / 7.0
+"""Of the contacts with edges, on parts of what is rare among random ones."""
+_STEEP_SEED: Final = 500_000
 _OTHER_SEED: Final = 1_000_000
 _MOST_VALIDATION: Final = 8000
 """Contacts of a validation set: more of them choose no other epoch."""
@@ -126,7 +131,9 @@ class Imagined:
     def contacts(self, samples: int, seed: int) -> Iterator[SampledContact]:
         """Random ones."""
         if self.feature == "edge":
-            return edge_contacts(samples, seed, variation=USUAL_VARIATION)
+            steep = round(_STEEP * samples)
+            usual = edge_contacts(samples - steep, seed, variation=USUAL_VARIATION)
+            return chain(usual, edge_contacts(steep, seed + _STEEP_SEED, variation=USUAL_VARIATION, part=steep_part))
         if self.feels == "shape":
             return shape_contacts(samples, seed, depth_mm=DEPTH_MM, variation=USUAL_VARIATION)
         if self.sensor is None:
