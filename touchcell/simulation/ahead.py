@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Final
 
 import numpy as np
@@ -33,6 +33,7 @@ _MOST_TURN_RAD: Final = math.radians(60.0)
 _AT_EDGE_MM_DEG: Final = np.array([-2.0, 0.0, -5.0, 0.0, 0.0, 0.0])
 _ON_FACE_M: Final = 0.5e-3
 """How far inside its edge a tip is moved along, so that at a corner the next edge is the nearer one."""
+_ON_EDGE_M: Final = 0.2e-3
 _FEWEST_OF_LOOP: Final = 8
 _FAR: Final = 4.0
 """How much further than the reach is searched, to say how far away the surface is."""
@@ -98,7 +99,7 @@ def way_along_edge(
     distance_m: float,
     step_m: float,
 ) -> Array | None:
-    """Return the way (n, 3), m, of a tip along the edge that it meets, until the way is long enough or closed.
+    """Return the frames {e} (n, 4, 4) along the edge that a tip meets, until the way is long enough or closed.
 
     Args:
         surfaces: what stands still.
@@ -112,20 +113,26 @@ def way_along_edge(
     T_world_e = None if met is None else nearest_edge(surfaces, met, 0.0, tip_radius_m)
     if T_world_e is None:
         return None
-    way = [T_world_e[:3, 3]]
+    way = [T_world_e]
     ahead = np.eye(4)
     ahead[:2, 3] = -_ON_FACE_M, step_m
     for _ in range(math.ceil(distance_m / abs(step_m))):
         T_world_e = nearest_edge(surfaces, se3.compose(T_world_e, ahead), 0.0, tip_radius_m)
         assert T_world_e is not None
-        way.append(T_world_e[:3, 3])
-        if len(way) > _FEWEST_OF_LOOP and float(np.linalg.norm(way[-1] - way[0])) < abs(step_m):
+        way.append(T_world_e)
+        if len(way) > _FEWEST_OF_LOOP and float(np.linalg.norm((way[-1] - way[0])[:3, 3])) < abs(step_m):
             break
     return np.array(way)
 
 
 def start_near(
-    surfaces: Mapping[str, Surface], T_world_s: Array, tip_radius_m: float, reach_m: float, *, on_edge: bool = False
+    surfaces: Mapping[str, Surface],
+    T_world_s: Array,
+    tip_radius_m: float,
+    reach_m: float,
+    *,
+    on_edge: bool = False,
+    allowed: Callable[[Array], bool] = lambda T_world_s: True,
 ) -> Array | None:
     """Return the pose (4, 4) of a sensor, near that of a start, from which it comes upon a surface.
 
@@ -138,6 +145,7 @@ def start_near(
         tip_radius_m: radius of the tip.
         reach_m: distance within which it has to make contact.
         on_edge: it shall come down on an edge, with its x axis across it and away from the face.
+        allowed: tells whether the sensor may be at a pose.
     """
     bodies = list(surfaces.values())
 
@@ -155,7 +163,7 @@ def start_near(
             if T_world_e is None:
                 continue
             T = se3.compose(T_world_e, se3.from_euler_mm_deg(_AT_EDGE_MM_DEG))
-        if is_good(T):
+        if is_good(T) and allowed(T):
             return T
     return None
 
@@ -248,7 +256,9 @@ def points_over(
 ) -> Array | None:
     """Return where (n, 3), m, a tip's centre is at points (n, 2), m, of the plane in which its contact settles.
 
-    The arguments are those of ``way_over``. Where nothing is below a point, the place in the plane is returned.
+    The arguments are those of ``way_over``. The result is (n, 2, 3) with the outward normals of what is touched there;
+    where nothing is below a point, it is the place in the plane, and nan; so is the normal where an edge is touched
+    from beyond its face.
     """
     met = first_contact(surfaces, T_world_s[:3, 3], T_world_s[:3, 2], height_m, reach_m)
     if met is None:
@@ -260,8 +270,23 @@ def points_over(
         place = origin + R[:, :2] @ np.array([x, y])
         above = place - reach_m * R[:, 2]
         below = first_contact(surfaces, above, R[:, 2], height_m, 2.0 * reach_m)
-        found.append(place if below is None else below[0])
+        if below is None:
+            below = place, np.full(3, np.nan)
+        elif _is_beyond_face(surfaces, *below, height_m):
+            below = below[0], np.full(3, np.nan)
+        found.append(below)
     return np.array(found)
+
+
+def _is_beyond_face(surfaces: Sequence[Surface], centre: Array, normal: Array, height_m: float) -> bool:
+    """Return whether a tip whose centre is ``height_m`` over what it touches, along a normal (3,), touches an edge."""
+    T_world_e = nearest_edge(surfaces, _at(_turned(np.eye(3), normal), centre), 0.0, height_m)
+    if T_world_e is None:
+        return False
+    # {e} is as far over its edge, along the normal of the face.
+    away = centre - height_m * normal - (T_world_e[:3, 3] + height_m * T_world_e[:3, 2])
+    leaning = float(normal @ T_world_e[:3, 2]) > -math.cos(_STEEP_RAD)
+    return leaning and float(np.linalg.norm(away)) < _ON_EDGE_M
 
 
 def first_contact(

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import TypeAlias
 
 import numpy as np
 
@@ -16,6 +17,10 @@ from touchcell.drivers.core.scene import ContactState
 from touchcell.geometry.types import Array
 from touchcell.simulation.surfaces import Surface
 from touchcell.simulation.timeline import Restore
+
+_Three: TypeAlias = tuple[float, float, float]
+_Axes: TypeAlias = tuple[_Three, _Three, _Three]
+"""Rows of a rotation matrix. On so few numbers NumPy's calls would take most of a step."""
 
 _IDENTITY = np.eye(4)
 _OPPOSITE = 1e-9
@@ -70,12 +75,12 @@ class _Anchor:
     Attributes:
         surface: the surface.
         point: (3,) m, on the surface.
-        R: (3, 3) axes of {f} at ``point``.
+        axes: of {f} at ``point``.
     """
 
     surface: Surface
-    point: Array
-    R: Array
+    point: _Three
+    axes: _Axes
 
 
 @dataclass(slots=True)
@@ -93,7 +98,7 @@ class ContactModel:
     def held_point(self, surface: Surface) -> Array | None:
         """Return (3,) m, the point where the skin sticks to ``surface``, in its own frame; None where it does not."""
         anchor = self._anchor
-        return anchor.point if anchor is not None and anchor.surface is surface else None
+        return np.array(anchor.point) if anchor is not None and anchor.surface is surface else None
 
     def step(self, T_world_s: Array, surface: Surface, t_s: float) -> ContactState:
         """Advance the contact to time ``t_s`` with the sensor at ``T_world_s`` (4, 4)."""
@@ -104,45 +109,52 @@ class ContactModel:
         T_world_b = surface.motion.pose(t_s)
         R_world_b = T_world_b[:3, :3]
         R_b_s = R_world_b.T @ T_world_s[:3, :3]
-        centre = R_world_b.T @ (T_world_s[:3, 3] - T_world_b[:3, 3])
-        nearest = surface.shape.nearest(centre)
+        nearest = surface.shape.nearest(R_world_b.T @ (T_world_s[:3, 3] - T_world_b[:3, 3]))
         depth = self.law.tip_radius_m - nearest.distance_m
-        R_tilt = tilt_of(-nearest.normal @ R_b_s)
+        inward = _three(-nearest.normal)
+        tilt = _tilt_axes(*(-nearest.normal @ R_b_s).tolist())
 
         if depth <= 0.0:
             self._anchor = None
+            R_tilt = np.array(tilt)
             R_b_f = R_b_s @ R_tilt.T
             return lambda: self._state(T_world_s, R_world_b @ R_b_f, R_tilt, (0.0, 0.0, depth), slipping=False)
 
+        px, py, pz = point = _three(nearest.point)
         anchor = self._anchor
         if anchor is None or anchor.surface is not surface:
-            anchor = self._anchor = _Anchor(surface, nearest.point, R_b_s @ R_tilt.T)
-        R_b_f = _transport(anchor.R, -nearest.normal)
+            anchor = self._anchor = _Anchor(surface, point, _rows(R_b_s @ np.array(tilt).T))
+        axes = _transport(anchor.axes, inward)
         slipping = False
 
-        shear_x, shear_y, _ = ((nearest.point - anchor.point) @ R_b_f).tolist()
+        ax, ay, az = anchor.point
+        shear_x, shear_y = _along(axes, px - ax, py - ay, pz - az)
         length, longest = math.hypot(shear_x, shear_y), self.law.max_shear_m(depth)
         if length > longest:
             slipping = True
-            shear_x, shear_y = shear_x * longest / length, shear_y * longest / length
-            dragged = nearest.point + (anchor.point - nearest.point) * (longest / length)
-            held = surface.shape.nearest(dragged)
-            anchor.point = held.point
-            anchor.R = _transport(anchor.R, -held.normal)
-            R_b_f = _transport(anchor.R, -nearest.normal)
+            share = longest / length
+            shear_x, shear_y = shear_x * share, shear_y * share
+            held = surface.shape.nearest(
+                np.array([px + (ax - px) * share, py + (ay - py) * share, pz + (az - pz) * share])
+            )
+            anchor.point = _three(held.point)
+            anchor.axes = _transport(anchor.axes, _three(-held.normal))
+            axes = _transport(anchor.axes, inward)
 
         # The first column of the torsion, R_b_f.T @ R_b_s @ R_tilt.T.
-        cos, sin, _ = ((R_b_s @ R_tilt[0]) @ R_b_f).tolist()
+        cos, sin = _along(axes, *(R_b_s @ tilt[0]).tolist())
         torsion = math.atan2(sin, cos)
         largest = self.law.max_torsion_rad(depth)
         if abs(torsion) > largest:
             slipping = True
             held_torsion = math.copysign(largest, torsion)
-            anchor.R = anchor.R @ about_z(torsion - held_torsion)
-            R_b_f = R_b_f @ about_z(torsion - held_torsion)
+            anchor.axes = _turned(anchor.axes, torsion - held_torsion)
+            axes = _turned(axes, torsion - held_torsion)
             torsion = held_torsion
         position = shear_x, shear_y, depth
-        return lambda: self._state(T_world_s, R_world_b @ R_b_f, about_z(torsion) @ R_tilt, position, slipping=slipping)
+        return lambda: self._state(
+            T_world_s, R_world_b @ axes, about_z(torsion) @ np.array(tilt), position, slipping=slipping
+        )
 
     def snapshot(self) -> Restore:
         """Return a function that restores the present contact."""
@@ -188,18 +200,19 @@ def contact_at(T_f_s: Array, law: ContactLaw) -> ContactState:
 def tilt_of(inward_in_s: Array) -> Array:
     """Return the tilt (3, 3) of a sensor: the Ry(beta) Rx(alpha) that takes ``inward_in_s`` (3,), the inward normal in
     {s}, to the z axis of {f}."""
-    x, y, z = inward_in_s.tolist()
+    return np.array(_tilt_axes(*inward_in_s.tolist()))
+
+
+def _tilt_axes(x: float, y: float, z: float) -> _Axes:
     # The inverse rotation takes z to (-sin beta, sin alpha cos beta, cos alpha cos beta).
     cos_beta = math.hypot(y, z)
     # With the normal along the sensor's x axis alpha is free.
     sin_alpha, cos_alpha = (y / cos_beta, z / cos_beta) if cos_beta > 1e-12 else (0.0, 1.0)
     sin_beta = -x
-    return np.array(
-        [
-            [cos_beta, sin_beta * sin_alpha, sin_beta * cos_alpha],
-            [0.0, cos_alpha, -sin_alpha],
-            [-sin_beta, cos_beta * sin_alpha, cos_beta * cos_alpha],
-        ]
+    return (
+        (cos_beta, sin_beta * sin_alpha, sin_beta * cos_alpha),
+        (0.0, cos_alpha, -sin_alpha),
+        (-sin_beta, cos_beta * sin_alpha, cos_beta * cos_alpha),
     )
 
 
@@ -209,10 +222,36 @@ def about_z(angle: float) -> Array:
     return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
 
 
-def _transport(R: Array, z: Array) -> Array:
-    """Rotate axes ``R`` (3, 3) by the smallest rotation that brings their z axis to the unit vector ``z`` (3,)."""
-    (x0, _, a0), (x1, _, a1), (x2, _, a2) = R.tolist()
-    b0, b1, b2 = z.tolist()
+def _three(vector: Array) -> _Three:
+    x, y, z = vector.tolist()
+    return x, y, z
+
+
+def _rows(R: Array) -> _Axes:
+    return _three(R[0]), _three(R[1]), _three(R[2])
+
+
+def _along(axes: _Axes, x: float, y: float, z: float) -> tuple[float, float]:
+    """Return the components of a vector along the first two axes."""
+    (a, b, _), (c, d, _), (e, f, _) = axes
+    return a * x + c * y + e * z, b * x + d * y + f * z
+
+
+def _turned(axes: _Axes, angle: float) -> _Axes:
+    """Return the axes turned by ``angle`` about their z axis."""
+    sin, cos = math.sin(angle), math.cos(angle)
+    (a, b, x), (c, d, y), (e, f, z) = axes
+    return (
+        (a * cos + b * sin, b * cos - a * sin, x),
+        (c * cos + d * sin, d * cos - c * sin, y),
+        (e * cos + f * sin, f * cos - e * sin, z),
+    )
+
+
+def _transport(axes: _Axes, z: _Three) -> _Axes:
+    """Turn ``axes`` by the smallest rotation that brings their z axis to the unit vector ``z``."""
+    (x0, _, a0), (x1, _, a1), (x2, _, a2) = axes
+    b0, b1, b2 = z
     # x + v x x + v x (v x x) / (1 + a.b) with v = a x b; x is normal to a, so it is x - (a + b) (b.x) / (1 + a.b).
     # Where the nearest point jumps to the other side of a plate every half turn is as small: the one about x.
     toward = 1.0 + a0 * b0 + a1 * b1 + a2 * b2
@@ -223,10 +262,4 @@ def _transport(R: Array, z: Array) -> Array:
     x0, x1, x2 = x0 - b0 * along, x1 - b1 * along, x2 - b2 * along
     length = math.sqrt(x0 * x0 + x1 * x1 + x2 * x2)
     x0, x1, x2 = x0 / length, x1 / length, x2 / length
-    return np.array(
-        [
-            [x0, b1 * x2 - b2 * x1, b0],
-            [x1, b2 * x0 - b0 * x2, b1],
-            [x2, b0 * x1 - b1 * x0, b2],
-        ]
-    )
+    return (x0, b1 * x2 - b2 * x1, b0), (x1, b2 * x0 - b0 * x2, b1), (x2, b0 * x1 - b1 * x0, b2)

@@ -8,7 +8,7 @@ edge with the tip: its y is zero.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import islice
 from typing import Final
@@ -23,6 +23,7 @@ from touchcell.simulation.contact import ContactLaw, about_z
 from touchcell.simulation.edge_ways import contacts_on_way
 from touchcell.simulation.edges import nearest_edge
 from touchcell.simulation.meshes.mesh_shape import MeshShape
+from touchcell.simulation.meshes.smoothing import TriangleMesh
 from touchcell.simulation.pressed import pressed
 from touchcell.simulation.random_parts import random_part
 from touchcell.simulation.samples import SampledContact, Variation, scattered
@@ -40,9 +41,11 @@ _PAST_MEAN: Final = (0.0, 0.0, 3.0, 0.0, 0.0)
 _PAST_SPREAD: Final = (1.2, 0.0, 0.7, 3.0, 3.0)
 """Offset, way along the edge, depth and both tilts, mm and deg, of a tip that glides past a corner."""
 _CORNER_RAD: Final = math.radians(15.0)
+_RIM_RAD: Final = math.radians(50.0)
+_SAME_M: Final = 1e-9
 _BESIDE_CORNER_M: Final = 14e-3
 """As far as a tip at a side feels the next one."""
-_ON_WAYS: Final = 0.6
+_ON_WAYS: Final = 0.7
 """Of the parts, along which the tip glides as a controller does, rather than being put down anywhere."""
 _BEFORE_CORNER: Final = 0.8
 _BEFORE_M: Final = 15e-3
@@ -97,14 +100,20 @@ class EdgeRanges:
 
 
 def edge_contacts(
-    n: int, seed: int, *, ranges: EdgeRanges | None = None, variation: Variation | None = None
+    n: int,
+    seed: int,
+    *,
+    ranges: EdgeRanges | None = None,
+    variation: Variation | None = None,
+    part: Callable[[np.random.Generator], TriangleMesh] = random_part,
 ) -> Iterator[SampledContact]:
-    """Yield ``n`` random contacts with edges, the same for the same seed."""
-    rng = np.random.default_rng(seed)
+    """Yield ``n`` random contacts with edges, the same for the same seed; ``part`` draws what is touched."""
     ranges, variation, law = ranges or EdgeRanges(), variation or Variation(), ContactLaw()
     for start in range(0, n, _IMAGES_PER_TIP):
+        # Of its own for each part: a longer draw begins with the shorter one.
+        rng = np.random.default_rng([seed, start])
         tip = Tip(scattered(TipParameters(), variation, rng))
-        shape = MeshShape(random_part(rng), _CREASE_RAD)
+        shape = MeshShape(part(rng), _CREASE_RAD)
         made = _on_ways if rng.random() < _ON_WAYS else _anywhere
         for T_e_s, pixels in islice(made(shape, tip, ranges, law, rng), min(_IMAGES_PER_TIP, n - start)):
             pixels = pixels + rng.normal(0.0, variation.marker_px, pixels.shape)
@@ -206,13 +215,17 @@ def _past_corner(
 
 
 def _corners(shape: MeshShape) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the pieces of the rim of a part, and those of them that end at a corner."""
+    """Return the pieces of the rims of a part, and those of them that end at a corner."""
     edges = shape.edges
-    upper = np.flatnonzero(edges.middle_normals[:, :, 2].max(axis=1) > math.cos(math.radians(50.0)))
+    normals = edges.middle_normals
+    # Where the mesh of a part ends, both normals are the same: no edge.
+    sharp = np.einsum("kc,kc->k", normals[:, 0], normals[:, 1]) < math.cos(_CREASE_RAD)
+    upper = np.flatnonzero(sharp & (normals[:, :, 2].max(axis=1) > math.cos(_RIM_RAD)))
     sides = edges.ends[upper] - edges.starts[upper]
     units = sides / np.linalg.norm(sides, axis=1, keepdims=True)
     bends = np.einsum("kc,kc->k", units, np.roll(units, -1, axis=0))
-    return upper, upper[np.abs(bends) < math.cos(_CORNER_RAD)]
+    apart = np.linalg.norm(np.roll(edges.starts[upper], -1, axis=0) - edges.ends[upper], axis=1)
+    return upper, upper[(np.abs(bends) < math.cos(_CORNER_RAD)) & (apart < _SAME_M)]
 
 
 def _frame_at(shape: MeshShape, surface: Surface, radius_m: float, i: int, share: float) -> Array:

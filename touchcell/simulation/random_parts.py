@@ -14,63 +14,165 @@ from touchcell.simulation.meshes.smoothing import TriangleMesh
 
 _WALL_M: Final = 25e-3
 _INWARDS_M: Final = (0.0, 2e-3, 5e-3, 9e-3, 14e-3, 20e-3, 28e-3, 40e-3)
-_OUTWARDS_M: Final = (0.0, 2e-3, 5e-3, 9e-3, 14e-3, 20e-3, 28e-3, 40e-3)
-_INNERMOST: Final = 0.15
+_OUTER: Final = 0.85
+_HOLES: Final = 0.3
+_LEANING: Final = 0.75
 _BLUNTEST_RAD: Final = math.radians(50.0)
-_SHARPEST_RAD: Final = math.radians(35.0)
+_SHARPEST_RAD: Final = math.radians(40.0)
 _DOWN_M: Final = (3e-3, 7e-3, 12e-3, 18e-3, _WALL_M)
 _WALL_PER_M: Final = 45.0
 _NARROWEST: Final = 0.15
-"""Size of a part's foot, as a share of its face."""
+"""Size of a part's foot, as a share of its face, about."""
+_SHEETS: Final = 0.25
+_SHEET_M: Final = (3e-3, 8e-3)
+_UNDERSIDE_M: Final = (5e-3, 12e-3, 25e-3)
+_RINGS: Final = 0.1
+_RING_M: Final = (4e-3, 12e-3)
+_FLAT: Final = 0.25
+_BENT: Final = 0.6
+_DIFFERENCE_M: Final = 1e-6
+_STEEP_HOLES: Final = 0.45
+_STEEP_FLAT: Final = 0.3
+_STEEP_BENT: Final = 0.6
+_STEEP_CURVATURE_PER_M: Final = (6.0, 36.0)
+_STEEP_WAVES_PER_M: Final = (70.0, 135.0)
+_STEEP_SHARE: Final = (1.0, 2.3)
 _SHARPEST_CURVATURE_PER_M: Final = 36.0
 _STEEPEST_WAVE: Final = 0.35
 _WAVES_PER_M: Final = (45.0, 130.0)
 
 
+def steep_part(rng: np.random.Generator) -> TriangleMesh:
+    """Return a part of what is rare among random ones: leaning, bent walls, and faces that bend tightly both ways.
+
+    Between a third and a quarter of the faces are flat, as beside the rim of a bowl; outlines have few corners.
+    """
+    hole = bool(rng.random() < _STEEP_HOLES)
+    outline = _outline(rng, hole=hole, kind=rng.uniform(0.12, 0.6))
+    lean, wall_per_m = rng.uniform(-_BLUNTEST_RAD, _SHARPEST_RAD), rng.uniform(-_WALL_PER_M, _WALL_PER_M)
+    sheet_m = rng.uniform(*_SHEET_M) if rng.random() < _SHEETS else None
+    middle = outline[rng.integers(len(outline))]
+    return _part(outline, middle, _steep_heights(rng), lean, wall_per_m, sheet_m, None, hole=hole, exact=True)
+
+
+def _steep_heights(rng: np.random.Generator) -> Callable[[Array], Array]:
+    kind, turns = rng.random(), rng.uniform(0.0, math.pi, 2)
+    if kind < _STEEP_FLAT:
+        return _flat
+    if kind < _STEEP_BENT:
+        curvature = rng.uniform(*_STEEP_CURVATURE_PER_M, 2) * rng.choice([-1.0, 1.0], 2)
+        return _bent(turns[0], curvature)
+    # Two alike across each other, as in an egg box.
+    per_m = rng.uniform(*_STEEP_WAVES_PER_M)
+    across = np.array([turns[0], turns[0] + 0.5 * math.pi])
+    return _waves(across, np.full(2, per_m), rng.uniform(*_STEEP_SHARE, 2), rng.uniform(0.0, 2.0 * math.pi, 2))
+
+
 def random_part(rng: np.random.Generator) -> TriangleMesh:
     """Return a part whose rim is an edge between a face above and a wall below; its face looks towards +z.
 
-    A third of the faces are flat, the others bend both ways or are waves, with radii down to 28 mm. Half of the walls
-    lean, more of them as a bowl's do, and most of these bend. Outlines are circles, waves round a circle, drops with
-    one sharp end, polygons and stars; three in ten are the rims of holes.
+    A quarter of the faces are flat, the others bend both ways or are waves, with radii down to 28 mm, so that rims lead
+    through space. Three quarters of the walls lean, so that they meet a face at 50 to 140 deg, and most of these bend,
+    as a bowl's do. Outlines are circles, waves round a circle, drops with one sharp end, polygons and stars; three in
+    ten are the rims of holes. A quarter are sheets 3 to 8 mm thick, a tenth are rings no wider than 12 mm, like the
+    rim of a cup.
     """
-    hole = bool(rng.random() < 0.3)
-    outline = _outline(rng, hole=hole)
+    hole = bool(rng.random() < _HOLES)
+    outline = _outline(rng, hole=hole, kind=rng.random())
     heights = _random_heights(rng)
     # Walls that lean under the face are as sharp as those of thin plates; blunt ones are those of bowls.
-    lean = rng.uniform(-_BLUNTEST_RAD, _SHARPEST_RAD) * (rng.random() < 0.5)
+    lean = rng.uniform(-_BLUNTEST_RAD, _SHARPEST_RAD) * (rng.random() < _LEANING)
     wall_per_m = rng.uniform(-_WALL_PER_M, _WALL_PER_M) * (lean != 0.0 and rng.random() < 0.6)
-    down = np.array(_DOWN_M)[::-1]
-    under = (math.tan(lean) * down + 0.5 * wall_per_m * down**2)[:, None, None]
-    length = np.linalg.norm(outline, axis=1, keepdims=True)
     middle = outline[rng.integers(len(outline))]
-    if hole:
-        rings = np.stack([outline * (1.0 + away / length) for away in _OUTWARDS_M])
-        wall = outline * np.maximum(1.0 + under / length, _NARROWEST)
+    kind = rng.random()
+    sheet_m = rng.uniform(*_SHEET_M) if kind < _SHEETS else None
+    ring_m = rng.uniform(*_RING_M) if kind > 1.0 - _RINGS else None
+    return _part(outline, middle, heights, lean, wall_per_m, sheet_m, ring_m, hole=hole)
+
+
+def _part(
+    outline: Array,
+    middle: Array,
+    heights: Callable[[Array], Array],
+    lean: float,
+    wall_per_m: float,
+    sheet_m: float | None,
+    ring_m: float | None,
+    *,
+    hole: bool,
+    exact: bool = False,
+) -> TriangleMesh:
+    """Return the part with a rim over ``outline`` (n, 2) m, whose face bends about ``middle`` (2,) m.
+
+    Its wall leans by ``lean`` rad under the face and bends; it is a sheet or a ring of so many metres, if any. With
+    ``exact`` the mesh is told the normals of its face: facets of 5 mm tell those of a tight bend to 3 deg only.
+    """
+    length = np.linalg.norm(outline, axis=1, keepdims=True)
+
+    def beside(offsets_m: Array) -> Array:
+        """Return the outline moved to the side where the face is: rows (k, n, 2) m."""
+        share = (1.0 if hole else -1.0) * offsets_m[:, None, None] / length
+        # Never through the middle, and no two rows in one place.
+        scale: Array = np.where(share < 0.0, np.maximum(1.0 + share, _NARROWEST * np.exp(share)), 1.0 + share)
+        return outline * scale
+
+    def on_face(rows: Array) -> Array:
+        # Bent about a point of the rim, so that it stays a height over the plane however large the part is.
+        return np.concatenate([rows, heights(rows - middle)[..., None]], axis=2)
+
+    inwards = np.array(_INWARDS_M)
+    if ring_m is not None:
+        face = on_face(beside(np.linspace(0.0, ring_m, 4)))
+    elif hole:
+        face = on_face(beside(inwards))
     else:
-        shares = 1.0 - np.array(_INWARDS_M) / max(float(length.max()), _INWARDS_M[-1] / (1.0 - _INNERMOST))
-        rings = outline * shares[:, None, None]
-        wall = outline * np.maximum(1.0 - under / length, _NARROWEST)
-    # Bent about a point of the rim, so that it stays a height over the plane however large the part is.
-    face = np.concatenate([rings, heights(rings - middle)[..., None]], axis=2)
-    below = np.concatenate([wall, face[:1, :, 2:] - down[:, None, None]], axis=2)
-    count, rows = len(outline), len(face) + len(below)
-    vertices = np.concatenate([below, face]).reshape(-1, 3)
-    faces = grid_faces(rows, count, closed=True)
+        face = on_face(outline * (1.0 - inwards / max(float(length.max()), inwards[-1] / _OUTER))[:, None, None])
+    down = np.array(_DOWN_M) if sheet_m is None else sheet_m * np.array([0.5, 1.0])
+    under = np.tan(lean) * down + 0.5 * wall_per_m * down**2
+    rows = [np.concatenate([beside(under), face[:1, :, 2:] - down[:, None, None]], axis=2)[::-1], face]
+    if sheet_m is not None:
+        rows.insert(0, (on_face(beside(under[-1] + np.array(_UNDERSIDE_M))) - [0.0, 0.0, sheet_m])[::-1])
+    open_inside = hole or ring_m is not None
+    if open_inside:
+        rows.append(face[-1] - np.array([[[0.0, 0.0, _WALL_M]]]))
+    grid = np.concatenate(rows)
+    vertices, faces = grid.reshape(-1, 3), grid_faces(len(grid), len(outline), closed=True)
     if hole:
-        return TriangleMesh(vertices, np.ascontiguousarray(faces[:, ::-1]))
+        faces = np.ascontiguousarray(faces[:, ::-1])
+    first = len(rows[0]) + (0 if sheet_m is None else len(rows[1]))
+    of_face = np.full((len(vertices), 3), np.nan)
+    on = slice(first * len(outline), (first + len(face)) * len(outline))
+    of_face[on] = _normals(heights, vertices[on, :2] - middle)
+    if open_inside:
+        return TriangleMesh(vertices, faces, _told(of_face, faces) if exact else None)
+    count = len(outline)
     here, there = np.arange(count), (np.arange(count) + 1) % count
-    centre_z = float(heights(-middle))
-    vertices = np.concatenate([vertices, [[0.0, 0.0, centre_z]]])
-    last = (rows - 1) * count
+    vertices = np.concatenate([vertices, [[0.0, 0.0, float(heights(-middle))]]])
+    last = (len(grid) - 1) * count
     lid = np.stack([np.full(count, len(vertices) - 1), last + here, last + there], axis=1)
-    return TriangleMesh(vertices, np.concatenate([faces, lid]).astype(np.int32))
+    of_face = np.concatenate([of_face, _normals(heights, -middle[None])])
+    faces = np.concatenate([faces, lid]).astype(np.int32)
+    return TriangleMesh(vertices, faces, _told(of_face, faces) if exact else None)
 
 
-def _outline(rng: np.random.Generator, *, hole: bool) -> Array:
+def _normals(heights: Callable[[Array], Array], points: Array) -> Array:
+    """Return (n, 3) upward unit normals at points (n, 2) m."""
+    steps = _DIFFERENCE_M * np.eye(2)
+    slopes = [(heights(points + step) - heights(points - step)) / (2.0 * _DIFFERENCE_M) for step in steps]
+    normals = np.stack([-slopes[0], -slopes[1], np.ones(len(points))], axis=1)
+    return normals / np.linalg.norm(normals, axis=1, keepdims=True)
+
+
+def _told(of_vertices: Array, faces: Array) -> Array:
+    """Return (m, 3, 3) normals at the corners of triangles that lie on the face, NaN for the others."""
+    corners = of_vertices[faces]
+    corners[~np.isfinite(corners).all(axis=(1, 2))] = np.nan
+    return corners
+
+
+def _outline(rng: np.random.Generator, *, hole: bool, kind: float) -> Array:
     """Return (n, 2) m, counter-clockwise and seen whole from the origin."""
     smallest = 24e-3 if hole else 16e-3
-    kind = rng.random()
     if kind < 0.12 and not hole:
         return _drop(rng)
     if kind < 0.5:
@@ -122,14 +224,21 @@ def _drop(rng: np.random.Generator) -> Array:
 def _random_heights(rng: np.random.Generator) -> Callable[[Array], Array]:
     """Return a function of points (..., 2) m that gives the height (...) m of a face over the plane at each."""
     kind, turns = rng.random(), rng.uniform(0.0, math.pi, 2)
-    if kind < 0.35:
-        return lambda points: np.zeros(points.shape[:-1])
-    if kind < 0.65:
-        # Two bends across each other.
-        curvature = rng.uniform(-_SHARPEST_CURVATURE_PER_M, _SHARPEST_CURVATURE_PER_M, 2)
-        ways = _directions(turns[0] + np.array([0.0, 0.5 * math.pi]))
-        return lambda points: 0.5 * _bounded(points @ ways) @ curvature
+    if kind < _FLAT:
+        return _flat
+    if kind < _BENT:
+        return _bent(turns[0], rng.uniform(-_SHARPEST_CURVATURE_PER_M, _SHARPEST_CURVATURE_PER_M, 2))
     return random_waves(rng, turns)
+
+
+def _flat(points: Array) -> Array:
+    return np.zeros(points.shape[:-1])
+
+
+def _bent(turn: float, curvature_per_m: Array) -> Callable[[Array], Array]:
+    """Return the heights of two bends across each other, the first along ``turn`` rad."""
+    ways = _directions(turn + np.array([0.0, 0.5 * math.pi]))
+    return lambda points: 0.5 * _bounded(points @ ways) @ curvature_per_m
 
 
 def random_waves(rng: np.random.Generator, turns: Array) -> Callable[[Array], Array]:
@@ -137,9 +246,13 @@ def random_waves(rng: np.random.Generator, turns: Array) -> Callable[[Array], Ar
 
     Where they are tightest, radii are down to 14 mm where both add up and 28 mm along each.
     """
-    per_m = rng.uniform(*_WAVES_PER_M, 2)
+    per_m, share = rng.uniform(*_WAVES_PER_M, 2), rng.uniform(0.0, 2.0, 2)
+    return _waves(turns, per_m, share, rng.uniform(0.0, 2.0 * math.pi, 2))
+
+
+def _waves(turns: Array, per_m: Array, share: Array, phase: Array) -> Callable[[Array], Array]:
     highest_m = np.minimum(0.5 * _SHARPEST_CURVATURE_PER_M / per_m**2, 0.5 * _STEEPEST_WAVE / per_m)
-    amplitude_m, phase = rng.uniform(0.0, 2.0, 2) * highest_m, rng.uniform(0.0, 2.0 * math.pi, 2)
+    amplitude_m = share * highest_m
     waves = per_m * _directions(turns)
     return lambda points: np.cos(points @ waves + phase) @ amplitude_m
 

@@ -547,7 +547,7 @@ class SceneConfig(Section, SceneSection):
         return np.array([(motion.pose(t_s) @ held)[:3] for t_s in np.linspace(0.0, lasts_s, _RIDE_STEPS)])
 
     def points_over(self, T_world_s: Array, points: Array, depth_m: float, reach_m: float) -> Array | None:
-        """Return the places over surfaces that stand still; None where anything moves, or nothing is touched."""
+        """Return places and normals over what stands still; None where anything moves, or nothing is touched."""
         if not (surfaces := self._still()):
             return None
         return points_over(surfaces, T_world_s, points, 1e-3 * self.tip.radius_mm - depth_m, reach_m)
@@ -555,7 +555,7 @@ class SceneConfig(Section, SceneSection):
     def way_along_edge(
         self, T_world_s: Array, distance_m: float, reach_m: float, *, backward: bool = False
     ) -> Array | None:
-        """Return the way along an edge of surfaces that stand still; None where anything moves, or no edge is met."""
+        """Return frames along an edge of surfaces that stand still; None where anything moves, or no edge is met."""
         step_m = -_RIM_STEP_M if backward else _RIM_STEP_M
         return way_along_edge(self._still(), T_world_s, 1e-3 * self.tip.radius_mm, reach_m, distance_m, step_m)
 
@@ -578,12 +578,14 @@ class SceneConfig(Section, SceneSection):
             if ahead := remark_on_approach(surfaces, T_world_s, radius_m, reach_m):
                 yield f"sensors.{sensor}: {ahead}"
 
-    def start_near(self, T_world_s: Array, reach_m: float, *, on_edge: bool = False) -> Array | None:
+    def start_near(
+        self, T_world_s: Array, reach_m: float, allowed: Callable[[Array], bool], *, on_edge: bool = False
+    ) -> Array | None:
         """Return a start near one that does not come upon a surface that stands still, or upon its edge."""
         surfaces = {name: surface.build() for name, surface in self.surfaces.items()}
         if self.objects or not all(isinstance(surface.motion, Still) for surface in surfaces.values()):
             return None
-        return start_near(surfaces, T_world_s, 1e-3 * self.tip.radius_mm, reach_m, on_edge=on_edge)
+        return start_near(surfaces, T_world_s, 1e-3 * self.tip.radius_mm, reach_m, on_edge=on_edge, allowed=allowed)
 
     def edge_missed(self, T_world_s: Array, reach_m: float) -> str:
         """Return why the first contact with surfaces that stand still is not one with an edge."""

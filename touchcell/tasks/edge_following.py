@@ -200,7 +200,9 @@ def _build(config: EdgeFollowingConfig, context: TaskContext) -> ServoTask:
 def _motions(config: EdgeFollowingConfig) -> Iterator[PlannedMotion]:
     yield from servo_motions(config, shears=False)
     backward = config.direction == "backward"
-    yield PlannedRim(("distance_mm",), 1e-3 * config.distance_mm, backward, config.close_loop)
+    yield PlannedRim(
+        ("distance_mm",), 1e-3 * config.distance_mm, backward, config.close_loop, tilts=config.dimensions == 5
+    )
 
 
 SPEC = TaskSpec(

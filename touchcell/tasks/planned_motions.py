@@ -177,12 +177,14 @@ class PlannedRim:
         distance_m: along the edge, at most.
         backward: with the face to the right of the travel, seen from above it.
         closes: the way has to lead back to where it began.
+        tilts: the sensor stays normal to the face; otherwise as it was at the start.
     """
 
     key: Key
     distance_m: float
     backward: bool
     closes: bool
+    tilts: bool
 
 
 PlannedMotion: TypeAlias = (

@@ -21,6 +21,8 @@ from touchcell.paths import CONFIGS
 
 SHIPPED = {path.stem: load_layers(path).data for path in CONFIGS.glob("*_sim.yaml")}
 FOLLOW, PUSH, STEPS, EDGE = "surface_follow_sim", "single_push_sim", "steps_sim", "edge_follow_sim"
+MESH = "surface_mesh_sim"
+BAR = {"kind": "box", "size_mm": [200, 26, 20], "pose_mm_deg": [0, 0, -20, 0, 0, 0]}
 TOUCH = {"move": {"by_mm_deg": [0, 0, 40], "until": {"contact": True}}}
 PRESS = {"servo": {"depth_mm": 2, "until": {"time_s": 1}}}
 Change = tuple[str, Any]
@@ -190,6 +192,24 @@ FAILING = [
         r"mm the edge leads out of interlocks.workspace, which would trip: x = -4",
     ),
     (EDGE, [("task.distance_mm", 200)], "task.distance_mm", "200 mm along the edge do not lead back"),
+    (
+        MESH,
+        [("scene.surfaces", {"bar": BAR})],
+        "task.path",
+        r"leads off what it touches: below \(\d+, \d+\) mm of it is",
+    ),
+    (
+        MESH,
+        [("interlocks.tilt.limit_deg", 12)],
+        "task.path",
+        r"leans by 1\d deg, .* interlocks.tilt would trip at 12 deg",
+    ),
+    (
+        EDGE,
+        [("task.dimensions", 3), ("arms.arm.start_pose_mm_deg", [35, 0, 44, 180, 40, 0])],
+        "task.dimensions",
+        "its face leans by more than 35 deg against the tip, which stays as it starts: up to 40 deg",
+    ),
 ]
 
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import argparse
 import math
+from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
 
 from touchcell.cell.cli.arguments import Subparsers, add_command, positive, whole
 from touchcell.cell.cli.exit_codes import EXIT_OK, EXIT_TASK_FAILED
+from touchcell.cell.cli.sim_recipes import PRESETS, SimRecipe
 from touchcell.cell.cli.workers import add_workers, workers_of
 from touchcell.cell.config.find import find_cell
 from touchcell.progress import shown_progress
@@ -77,23 +79,22 @@ def _add_training(commands: Subparsers) -> None:
 
     train_sim = add_command(commands, "train-sim", _train_sim, "train the estimator that ships, on simulated images")
     _add_out(train_sim, "model file to write (.safetensors)")
-    train_sim.add_argument("--samples", type=positive, default=12_000, help="simulated images (default: %(default)s)")
     train_sim.add_argument(
-        "--kind", choices=_SIMULATED_KINDS, default="gdn", help="as of `train` (default: %(default)s)"
+        "--preset",
+        choices=tuple(PRESETS),
+        help="settings with which that model that ships was made; options beside it take the place of its own",
     )
+    train_sim.add_argument("--samples", type=positive, help="simulated images (default: 12000)")
+    train_sim.add_argument("--kind", choices=_SIMULATED_KINDS, help="as of `train` (default: gdn)")
     train_sim.add_argument("--tip", metavar="TIP", help="tip file of `calibrate-sim`, or the name of one that ships")
     train_sim.add_argument("--processed", action="store_true", help="for images as the public data have them")
     train_sim.add_argument(
         "--feature",
         choices=("surface", "edge", "kinds"),
-        default="surface",
-        help="what is touched; kinds: a classifier that tells nothing, surface, edge and corner (default: %(default)s)",
+        help="what is touched; kinds: a classifier that tells nothing, surface, edge and corner (default: surface)",
     )
     train_sim.add_argument(
-        "--feels",
-        choices=("plane", "shape"),
-        default="plane",
-        help="surfaces to press on: planes, or such as bend (default: %(default)s)",
+        "--feels", choices=("plane", "shape"), help="surfaces to press on: planes, or such as bend (default: plane)"
     )
     train_sim.add_argument("--epochs", type=positive, help="passes over the images (default: the kind's own)")
     _add_seed(train_sim)
@@ -200,24 +201,21 @@ def _train_many(options: argparse.Namespace, settings: dict[str, object]) -> int
 
 
 def _train_sim(options: argparse.Namespace) -> int:
-    if options.feature == "kinds":
+    given = {
+        each.name: value
+        for each in fields(SimRecipe)
+        # Of a flag that is not given, the default is False.
+        if (value := getattr(options, each.name)) is not None and value is not False
+    }
+    recipe = replace(PRESETS[options.preset] if options.preset else SimRecipe(), **given)
+    if recipe.feature == "kinds":
         from touchcell.cell.trainings.feature_kinds import train_kinds
 
-        print(train_kinds(options.out, samples=options.samples, epochs=options.epochs, seed=options.seed))
+        print(train_kinds(options.out, samples=recipe.samples, epochs=recipe.epochs, seed=recipe.seed))
         return EXIT_OK
     from touchcell.cell.cli.train_sim import train_on_simulation
 
-    train_on_simulation(
-        options.out,
-        samples=options.samples,
-        kind=options.kind,
-        tip=options.tip,
-        processed=options.processed,
-        epochs=options.epochs,
-        seed=options.seed,
-        feature=options.feature,
-        feels=options.feels,
-    )
+    train_on_simulation(options.out, recipe)
     return EXIT_OK
 
 

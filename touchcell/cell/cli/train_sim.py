@@ -10,11 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from touchcell.cell.cli.sim_recipes import Feels, SimRecipe
 from touchcell.drivers.replay.dataset import FRAME_SIZE, PUBLIC_CROP
 from touchcell.geometry import se3
 from touchcell.geometry.types import ImageArray
@@ -27,6 +29,7 @@ from touchcell.perception.networks.progress import Display, Observer
 from touchcell.perception.networks.training import Settings, train_on_arrays
 from touchcell.perception.runtime.estimator_spec import Feature
 from touchcell.simulation.edge_samples import edge_contacts
+from touchcell.simulation.random_parts import steep_part
 from touchcell.simulation.render import FrameRenderer
 from touchcell.simulation.samples import USUAL_VARIATION, SampledContact, Variation, contacts
 from touchcell.simulation.shape_samples import shape_contacts
@@ -35,9 +38,6 @@ from touchcell.simulation.tip_file import TipFile, load_tip
 
 if TYPE_CHECKING:
     from touchcell.perception.networks.marker_training import LabelledDiscs
-
-Feels: TypeAlias = Literal["plane", "shape"]
-"""What surfaces are made of."""
 
 PREPROCESSING = Preprocessing(
     input_size=(FRAME_SIZE[1], FRAME_SIZE[0]),
@@ -82,6 +82,13 @@ DETAIL_SETTINGS: Final[dict[str, Any]] = {
 }
 """Edges and tilts are told by tenths of a pixel (docs/decisions/0051-edges-in-detail.md)."""
 
+_STEEP: Final = 2.0 / 7.0
+"""Of the contacts with edges, on parts of what is rare among random ones."""
+_STEEP_SEED: Final = 500_000
+_OTHER_SEED: Final = 1_000_000
+_MOST_VALIDATION: Final = 8000
+"""Contacts of a validation set: more of them choose no other epoch."""
+
 PUBLIC_SIZE = (PUBLIC_CROP[3] - PUBLIC_CROP[1], PUBLIC_CROP[2] - PUBLIC_CROP[0])
 PUBLIC_MASK_PX = 216.0
 
@@ -124,7 +131,9 @@ class Imagined:
     def contacts(self, samples: int, seed: int) -> Iterator[SampledContact]:
         """Random ones."""
         if self.feature == "edge":
-            return edge_contacts(samples, seed, variation=USUAL_VARIATION)
+            steep = round(_STEEP * samples)
+            usual = edge_contacts(samples - steep, seed, variation=USUAL_VARIATION)
+            return chain(usual, edge_contacts(steep, seed + _STEEP_SEED, variation=USUAL_VARIATION, part=steep_part))
         if self.feels == "shape":
             return shape_contacts(samples, seed, depth_mm=DEPTH_MM, variation=USUAL_VARIATION)
         if self.sensor is None:
@@ -135,52 +144,39 @@ class Imagined:
         )
 
 
-def train_on_simulation(
-    out: Path,
-    *,
-    samples: int,
-    kind: str = "gdn",
-    tip: str | None = None,
-    processed: bool = False,
-    epochs: int | None = None,
-    seed: int = 0,
-    feature: Feature = "surface",
-    feels: Feels = "plane",
-) -> None:
-    """Draw ``samples`` training images and a fifth of that for validation, train, and write the model file.
+def train_on_simulation(out: Path, recipe: SimRecipe) -> None:
+    """Draw training images and a fifth of that for validation, 8000 at most, train, and write the model file ``out``.
 
-    Args:
-        out: ``NAME.safetensors``.
-        samples: training images.
-        kind: gdn, cnn or markers. Marker fields are not drawn: the centroids of drawn discs are off by 0.07 px.
-        tip: a tip file, or the name of one that ships; None for the default tip.
-        processed: for images as the public data have them rather than raw frames.
-        epochs: passes over the samples; None for the kind's default.
-        seed: of everything random.
-        feature: ``edge`` for contacts with edges, of the default tip.
-        feels: ``shape`` for surfaces that bend, of the default tip.
+    The recipe's feature is a surface or an edge.
 
     Raises:
         ConfigError: the tip file cannot be used.
         TrainingError: as ``touchcell.perception.networks.training.train``.
     """
-    imagined = Imagined(None if tip is None else load_tip(tip), processed, feature, feels)
+    assert recipe.feature != "kinds"
+    tip = None if recipe.tip is None else load_tip(recipe.tip)
+    imagined = Imagined(tip, recipe.processed, recipe.feature, recipe.feels)
+    seed, epochs = recipe.seed, recipe.epochs
     with Display() as display:
-        if kind == "markers":
-            _train_markers(imagined, out, samples, epochs, seed, display)
+        if recipe.kind == "markers":
+            _train_markers(imagined, out, recipe.samples, epochs, seed, display)
             return
-        training = draw(samples, seed, "train", display, imagined)
-        validation = draw(samples // 5, seed + 1_000_000, "val", display, imagined)
+        training = draw(recipe.samples, seed, "train", display, imagined)
+        validation = draw(_for_validation(recipe.samples), seed + _OTHER_SEED, "val", display, imagined)
         train_on_arrays(
             training,
             validation,
             out,
-            preprocessing=imagined.preprocessing(kind),
-            architecture=ARCHITECTURE.model_copy(update={"kind": kind}),
+            preprocessing=imagined.preprocessing(recipe.kind),
+            architecture=ARCHITECTURE.model_copy(update={"kind": recipe.kind}),
             settings=Settings(seed=seed, batch_size=32) if epochs is None else Settings(epochs, seed, batch_size=32),
-            reference=_out_of_contact(seed, imagined, kind),
+            reference=_out_of_contact(seed, imagined, recipe.kind),
             observer=display,
         )
+
+
+def _for_validation(samples: int) -> int:
+    return min(samples // 5, _MOST_VALIDATION)
 
 
 def _train_markers(
@@ -194,7 +190,7 @@ def _train_markers(
         settings = replace(settings, hidden=(384, 384, 256), networks=1, **DETAIL_SETTINGS)
     train_on_discs(
         _discs(imagined, samples, seed),
-        _discs(imagined, samples // 5, seed + 1_000_000),
+        _discs(imagined, _for_validation(samples), seed + _OTHER_SEED),
         out,
         preprocessing=imagined.preprocessing("markers"),
         size=MarkerSize.of_disc(np.pi * imagined.tip.disc_radius_px**2),

@@ -11,7 +11,7 @@ import numpy as np
 
 from touchcell.cell.config.demands import demands
 from touchcell.cell.config.rule_limits import is_kind, limits_of
-from touchcell.cell.config.starts import pose_of, sensor_in_world, start_of_sensor
+from touchcell.cell.config.starts import lean_rad, pose_of, sensor_in_world, start_of_sensor
 from touchcell.cell.config.yaml_file import KeyPath, YamlFile
 from touchcell.drivers.core.arm import LimitsConfig
 from touchcell.drivers.core.scene import scene_section
@@ -43,6 +43,9 @@ _LEAST_TOUCH_PERCENT: Final = 0.1
 """A quarter of a grey level."""
 _LIGHTEST: Final = 0.5
 """Part of the depth at which a contact ends as its image says that surely is none."""
+_LEAN_SLACK_DEG: Final = 3.0
+_MOST_TILT_RAD: Final = math.radians(35.0)
+"""Against the face beside an edge; networks are trained to 32 deg."""
 _WAY_SLACK_MM: Final = 5.0
 """By which a way over a surface may be elsewhere: the sensor turns with the surface a little late."""
 
@@ -64,7 +67,7 @@ def failing_motions(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
 
     Such a cell may be meant, as in a test of that very end, and is not refused.
     """
-    for problems in (_impossible, _times, _unmet, _left_behind, _along_edge):
+    for problems in (_impossible, _times, _unmet, _left_behind, _along_edge, _over_border):
         yield from problems(file, plan)
 
 
@@ -95,6 +98,12 @@ def places_outside(file: YamlFile, plan: CellPlan, ways: Ways) -> Iterator[Confi
 
 def _boxes(plan: CellPlan) -> dict[str, Any]:
     return {rule: box for rule, box in plan.cell.interlocks.items() if is_kind(box, "workspace")}
+
+
+def _cones(plan: CellPlan) -> dict[str, Any]:
+    """Return the cones that guard the axis of a sensor."""
+    rules: dict[str, Any] = dict(plan.cell.interlocks)
+    return {rule: cone for rule, cone in rules.items() if is_kind(cone, "tilt") and cone.sensor in plan.sensor_roles}
 
 
 def _ways_out(file: YamlFile, plan: CellPlan, ways: Ways) -> Iterator[ConfigError]:
@@ -138,9 +147,9 @@ def _ways(plan: CellPlan) -> Iterator[tuple[KeyPath, Array]]:
     retract_m = 1e-3 * float(getattr(plan.task_config, "retract_mm", 0.0))
     for motion in _motions(plan):
         if isinstance(motion, PlannedSlide) and motion.known and motion.corners_m:
-            way = scene.points_over(tip, np.array(motion.corners_m), motion.depth_m, reach_m)
-            if way is not None:
-                yield motion.key, first.in_base(way)
+            over = scene.points_over(tip, np.array(motion.corners_m), motion.depth_m, reach_m)
+            if over is not None:
+                yield motion.key, first.in_base(over[:, 0])
         elif isinstance(motion, PlannedSlide) and motion.known:
             way = scene.way_over(tip, motion.direction_rad, motion.distance_m, motion.depth_m, reach_m, retract_m)
             if way is not None:
@@ -259,11 +268,12 @@ def _along_edge(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
     if first is None:
         return
     for motion in rims:
-        way_m = first.scene.way_along_edge(
+        frames = first.scene.way_along_edge(
             first.T_world_sensor, motion.distance_m, first.reach_m, backward=motion.backward
         )
-        if way_m is None:
+        if frames is None:
             continue
+        way_m = frames[:, :3, 3]
         steps_m = np.linalg.norm(np.diff(way_m, axis=0), axis=1)
         for rule, box in _boxes(plan).items():
             if box.sensor not in plan.sensor_roles:
@@ -285,6 +295,49 @@ def _along_edge(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
                 value=1e3 * motion.distance_m,
                 hint="allow more, or leave out `close_loop`",
             )
+        if not motion.tilts and _has_model(plan):
+            cos = np.clip(frames[:, :3, 2] @ first.T_world_sensor[:3, 2], -1.0, 1.0)
+            leaning = np.flatnonzero(cos < math.cos(_MOST_TILT_RAD))
+            if leaning.size:
+                i = int(leaning[0])
+                yield file.problem(
+                    ("task", "dimensions"),
+                    f"after {1e3 * steps_m[:i].sum():.0f} mm along the edge its face leans by more than "
+                    f"{math.degrees(_MOST_TILT_RAD):.0f} deg against the tip, which stays as it starts: up to "
+                    f"{math.degrees(math.acos(float(cos.min()))):.0f} deg; no edge is read at that",
+                    hint="start with the tip upright over the part, or let it tilt: `dimensions: 5`",
+                )
+
+
+def _over_border(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
+    """Paths over a surface that lead off it, or to where it is steeper than a cone lets the sensor be."""
+    slides = [motion for motion in _motions(plan) if isinstance(motion, PlannedSlide) and motion.known]
+    first = _first_approach(plan) if slides else None
+    if first is None:
+        return
+    cones = _cones(plan)
+    R = first.T_world_base[:3, :3]
+    for motion in slides:
+        corners_m = np.array(motion.corners_m).reshape(-1, 2)
+        over = first.scene.points_over(first.T_world_sensor, corners_m, motion.depth_m, first.reach_m)
+        for (x, y), (_, normal) in zip(1e3 * corners_m, () if over is None else over, strict=False):
+            if np.isnan(normal).any():
+                yield file.problem(
+                    ("task", *motion.key),
+                    f"leads off what it touches: below ({x:.0f}, {y:.0f}) mm of it is nothing, or only an edge",
+                    hint="go less far, or start farther inside",
+                )
+                return
+            for rule, cone in cones.items():
+                lean_deg = math.degrees(lean_rad(-normal @ R, cone.direction))
+                if lean_deg > cone.limit_deg + _LEAN_SLACK_DEG:
+                    yield file.problem(
+                        ("task", *motion.key),
+                        f"leads to where the surface leans by {lean_deg:.0f} deg, at ({x:.0f}, {y:.0f}) mm of it; "
+                        f"interlocks.{rule} would trip at {cone.limit_deg:g} deg",
+                        hint="go less far, start elsewhere, or allow more tilt",
+                    )
+                    return
 
 
 def _extent(way_m: Array) -> float:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from touchcell.cell.config.rule_limits import is_kind
 from touchcell.geometry import se3
 from touchcell.geometry.errors import GeometryError
 from touchcell.geometry.types import Array
@@ -61,12 +64,37 @@ def start_near(plan: CellPlan, scene: SceneSection, sensor: str) -> str:
     arm, T_world_s = section.mounted_on, sensor_in_world(plan, sensor)
     if reach_mm is None or arm is None or T_world_s is None:
         return ""
-    found = scene.start_near(T_world_s, 1e-3 * reach_mm, on_edge=plan.task.feature == "edge")
+    T_world_base = plan.cell.arms[arm].T_world_base
+
+    def allowed(T: Array) -> bool:
+        return _is_allowed(plan, sensor, se3.inverse(T_world_base) @ T)
+
+    found = scene.start_near(T_world_s, 1e-3 * reach_mm, allowed, on_edge=plan.task.feature == "edge")
     if found is None:
         return ""
-    T_base_tcp = se3.inverse(plan.cell.arms[arm].T_world_base) @ found @ se3.inverse(section.T_tcp_sensor)
+    T_base_tcp = se3.inverse(T_world_base) @ found @ se3.inverse(section.T_tcp_sensor)
     numbers = ", ".join(f"{value:g}" for value in np.round(se3.to_euler_mm_deg(T_base_tcp), 1) + 0.0)
     return f"arms.{arm}.start_pose_mm_deg: [{numbers}]"
+
+
+def _is_allowed(plan: CellPlan, sensor: str, T_base_s: Array) -> bool:
+    """Return whether the boxes and cones that guard a sensor let it start at a pose (4, 4)."""
+    at_mm = 1e3 * T_base_s[:3, 3]
+    rules: Iterable[Any] = plan.cell.interlocks.values()
+    for rule in rules:
+        if plan.sensor_roles.get(getattr(rule, "sensor", None) or "") != sensor:
+            continue
+        if is_kind(rule, "workspace") and not ((rule.min_mm <= at_mm) & (at_mm <= rule.max_mm)).all():
+            return False
+        if is_kind(rule, "tilt") and lean_rad(T_base_s[:3, 2], rule.direction) > math.radians(rule.limit_deg):
+            return False
+    return True
+
+
+def lean_rad(axis: Array, direction: Sequence[float]) -> float:
+    """Return the angle between a unit vector (3,) and the axis (3,) of a cone."""
+    cone = np.array(direction) / np.linalg.norm(direction)
+    return math.acos(min(max(float(axis @ cone), -1.0), 1.0))
 
 
 def pose_of(pose_mm_deg: Any) -> Array | None:

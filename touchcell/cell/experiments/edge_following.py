@@ -44,6 +44,8 @@ _SAMPLED: Final = ("circle", "square", "clover")
 _QUICK: Final = ("circle", "square")
 _HEIGHT_MM: Final = 20.0
 _RIM_MM: Final = 45.0
+_TIP_MM: Final = 20.0
+_ABOVE_MM: Final = 5.0
 _INSIDE_MM: Final = 2.0
 _INSIDE_RIM_MM: Final = 0.5
 """On a face that leans its edge is not told from its middle farther inside."""
@@ -116,9 +118,12 @@ def surface_of(name: str) -> dict[str, Any]:
     return {"kind": "extrusion", "outline_mm": OUTLINES_MM[name].round(4).tolist(), "height_mm": _HEIGHT_MM}
 
 
-def start_pose_mm_deg(name: str) -> list[float]:
-    """Return a pose 5 mm above a face and 2 mm or less inside its edge, with x across the edge, away from the face."""
-    raised = _HEIGHT_MM + 25.0
+def start_pose_mm_deg(name: str, *, upright: bool = False) -> list[float]:
+    """Return a pose 5 mm above a face and 2 mm or less inside its edge, with x across the edge, away from the face.
+
+    The tip looks towards the face, or, if ``upright``, down.
+    """
+    raised = _HEIGHT_MM + _TIP_MM + _ABOVE_MM
     if name == "circle":
         return [50.0 - _INSIDE_MM, 0.0, raised, 180.0, 0.0, 0.0]
     if name == "bowl":
@@ -130,7 +135,11 @@ def start_pose_mm_deg(name: str) -> list[float]:
         low, height, high = HEIGHTS_MM[name](x, np.zeros(3)).tolist()
         lean = math.atan2(high - low, 0.2)
         away = np.array([-math.sin(lean), math.cos(lean)])
-        over = np.array([_RIM_MM - _INSIDE_RIM_MM, height]) + 25.0 * away
+        edge = np.array([_RIM_MM - _INSIDE_RIM_MM, height])
+        if upright:
+            x_mm, z_mm = (edge + _TIP_MM * away + np.array([0.0, _ABOVE_MM])).tolist()
+            return [x_mm, 0.0, z_mm, 180.0, 0.0, 0.0]
+        over = edge + (_TIP_MM + _ABOVE_MM) * away
         return [float(over[0]), 0.0, float(over[1]), 180.0, -float(np.degrees(lean)), 0.0]
     outline = OUTLINES_MM[name]
     # In the middle of a piece near the first third, away from corners of shapes that begin with one.
@@ -154,7 +163,8 @@ def trials(scale: Scale) -> list[Trial]:
             "edge_follow_sim.yaml",
             {
                 "scene.surfaces": {name: surface_of(name)},
-                "arms.arm.start_pose_mm_deg": start_pose_mm_deg(name),
+                # A tip that keeps its tilt meets the least of it where it begins upright.
+                "arms.arm.start_pose_mm_deg": start_pose_mm_deg(name, upright="task.dimensions" in changes),
                 "task.distance_mm": 800.0,
                 "task.direction": ("forward", "backward")[SHAPES.index(name) % 2],
                 "interlocks.tilt.limit_deg": 60,

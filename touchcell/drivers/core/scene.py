@@ -186,6 +186,7 @@ class SceneSection(BaseModel):
     def points_over(self, T_world_s: Array, points: Array, depth_m: float, reach_m: float) -> Array | None:
         """Return where (n, 3), m, the tip is at points (n, 2), m, of the plane of its first contact.
 
+        The result is (n, 2, 3): with each place the outward normal of the face that is touched, nan where none is.
         None where it makes no contact, or what it touches moves. The other arguments are those of ``way_over``.
         """
         return None
@@ -193,9 +194,9 @@ class SceneSection(BaseModel):
     def way_along_edge(
         self, T_world_s: Array, distance_m: float, reach_m: float, *, backward: bool = False
     ) -> Array | None:
-        """Return the way (n, 3), m, of a tip that approaches along its axis and then follows the edge that it meets.
+        """Return the frames {e} (n, 4, 4) along the edge that a tip meets which approaches along its axis.
 
-        It ends where it leads back to where it began. None where it meets no edge, or what it touches moves.
+        The way ends where it leads back to where it began. None where it meets no edge, or what it touches moves.
 
         Args:
             T_world_s: (4, 4) pose of the sensor at the start.
@@ -209,7 +210,9 @@ class SceneSection(BaseModel):
         """Return whether anything in it has an edge that could be followed."""
         return True
 
-    def start_near(self, T_world_s: Array, reach_m: float, *, on_edge: bool = False) -> Array | None:
+    def start_near(
+        self, T_world_s: Array, reach_m: float, allowed: Callable[[Array], bool], *, on_edge: bool = False
+    ) -> Array | None:
         """Return the pose (4, 4) of a sensor near that of a start, from which it comes upon something.
 
         None where the start itself will do, or no other one is known.

@@ -1,0 +1,43 @@
+"""What ``touchcell train-sim`` trains and on what, and how models that ship were made."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, Literal, TypeAlias
+
+from touchcell.perception.runtime.estimator_spec import Feature
+
+Feels: TypeAlias = Literal["plane", "shape"]
+"""What surfaces are made of."""
+
+
+@dataclass(frozen=True, slots=True)
+class SimRecipe:
+    """A training on simulated contacts; without arguments that of ``train-sim`` without options.
+
+    Attributes:
+        samples: training images.
+        kind: gdn, cnn or markers. Marker fields are not drawn: the centroids of drawn discs are off by 0.07 px.
+        tip: a tip file, or the name of one that ships; None for the default tip.
+        processed: for images as the public data have them rather than raw frames.
+        epochs: passes over the samples; None for the kind's default.
+        seed: of everything random.
+        feature: ``edge`` for contacts with edges, of the default tip; ``kinds`` for a classifier of what is touched.
+        feels: ``shape`` for surfaces that bend, of the default tip.
+    """
+
+    samples: int = 12_000
+    kind: str = "gdn"
+    tip: str | None = None
+    processed: bool = False
+    epochs: int | None = None
+    seed: int = 0
+    feature: Feature | Literal["kinds"] = "surface"
+    feels: Feels = "plane"
+
+
+PRESETS: Final = {
+    "sim_edge": SimRecipe(samples=144_000, kind="markers", epochs=16, feature="edge"),
+    "sim_shape": SimRecipe(samples=40_000, kind="markers", epochs=20, feels="shape"),
+}
+"""How the models of these names were made."""
