@@ -18,6 +18,7 @@ from touchcell.cell.config.schema import plan_cell
 from touchcell.cell.runtime.compose import compose
 from touchcell.cell.runtime.loop import RunLoop
 from touchcell.cell.runtime.run_result import Outcome
+from touchcell.drivers.core.clock import VirtualClock
 from touchcell.paths import CONFIGS
 
 _NETWORK = {"kind": "network", "model": "builtin:sim_gdn"}
@@ -101,6 +102,12 @@ def test_check_says_where(folder: Path, capsys: pytest.CaptureFixture[str]) -> N
         observing(folder, **changes)
         assert main(["check", str(folder / "cell.yaml")]) == EXIT_OK
         assert f"  perceives {told}\n" in capsys.readouterr().out
+
+
+def test_a_clock_of_the_callers_is_not_waited_for_in_a_thread(folder: Path) -> None:
+    plan = observing(folder, perceive_in="threads")
+    assert compose(plan).sensors["sensor"].threaded
+    assert not compose(plan, clock=VirtualClock()).sensors["sensor"].threaded
 
 
 def test_a_run_ends_its_threads(folder: Path) -> None:
