@@ -151,7 +151,8 @@ def camera_cell(
     if not roles:
         # Without an arm only the image shows a contact.
         sensors["sensor"] = _emulated_sensor(cameras["sensor"], {"kind": "network", "model": "builtin:sim_gdn"})
-    extra = _collect(task, collected)
+    # Where the network reads frames, it does so in a thread: in the loop's own it is tried with simulated faults.
+    extra = {**_collect(task, collected), "perceive_in": "threads"}
     data = _cell(task, arms, sensors, tips, extra, settings)
     data["interlocks"] |= {
         "stale_frame": {"kind": "frame_age", "limit_ms": 200},

@@ -18,6 +18,7 @@ from touchcell.cell.config.schema import plan_cell
 from touchcell.cell.runtime.compose import compose
 from touchcell.cell.runtime.loop import RunLoop
 from touchcell.cell.runtime.run_result import Outcome
+from touchcell.drivers.core.clock import VirtualClock
 from touchcell.paths import CONFIGS
 
 _NETWORK = {"kind": "network", "model": "builtin:sim_gdn"}
@@ -49,11 +50,10 @@ def observing(folder: Path, **changes: object) -> CellPlan:
 @pytest.mark.parametrize(
     ("sensors", "changes", "threaded"),
     [
-        (1, {}, False),
-        (2, {}, True),
+        (1, {}, True),
         (4, {}, True),
-        (2, {"rate_hz": 50}, False),
-        (1, {"rate_hz": 250}, True),
+        (1, {"rate_hz": 50}, False),
+        (2, {"rate_hz": 50}, True),
         (4, {"perceive_in": "loop"}, False),
         (1, {"perceive_in": "threads"}, True),
         (4, {"time": "simulated"}, False),
@@ -68,6 +68,13 @@ def test_threads_are_taken_where_a_cycle_does_not_hold_the_frames(
     cell = plan.cell.model_copy(update={"sensors": dict.fromkeys(names, plan.cell.sensors["sensor"])})
     found = threaded_sensors(cell, dict.fromkeys(names, plan.sensors["sensor"]))
     assert found == (set(names) if threaded else set())
+
+
+@pytest.mark.parametrize(("pace", "threaded"), [(1.0, True), (0.5, False)])
+def test_an_emulated_world_that_runs_slower_leaves_more_time(folder: Path, pace: float, *, threaded: bool) -> None:
+    plan = observing(folder)
+    cell = plan.cell.model_copy(update={"world": "emulated", "emulated_pace": pace})
+    assert bool(threaded_sensors(cell, plan.sensors)) == threaded
 
 
 @pytest.mark.parametrize("perceive_in", ["auto", "threads"])
@@ -88,13 +95,19 @@ def test_a_sensor_that_reads_no_frames_counts_for_nothing() -> None:
 
 def test_check_says_where(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for changes, told in (
-        ({}, "in the loop's thread: 1 frame of 4 ms, no more than half of a cycle of 10 ms"),
-        ({"rate_hz": 250}, "in a thread for each sensor: 1 frame of 4 ms, more than half of a cycle of 4 ms"),
-        ({"perceive_in": "threads"}, "in a thread for each sensor, as perceive_in says"),
+        ({"rate_hz": 50}, "in the loop's thread: 1 frame of 6 ms, no more than half of a cycle of 20 ms"),
+        ({}, "in a thread for each sensor: 1 frame of 6 ms, more than half of a cycle of 10 ms"),
+        ({"rate_hz": 50, "perceive_in": "threads"}, "in a thread for each sensor, as perceive_in says"),
     ):
         observing(folder, **changes)
         assert main(["check", str(folder / "cell.yaml")]) == EXIT_OK
         assert f"  perceives {told}\n" in capsys.readouterr().out
+
+
+def test_a_clock_of_the_callers_is_not_waited_for_in_a_thread(folder: Path) -> None:
+    plan = observing(folder, perceive_in="threads")
+    assert compose(plan).sensors["sensor"].threaded
+    assert not compose(plan, clock=VirtualClock()).sensors["sensor"].threaded
 
 
 def test_a_run_ends_its_threads(folder: Path) -> None:

@@ -164,6 +164,26 @@ def test_what_a_camera_raises_is_raised_in_the_loop_until_it_delivers_again(came
     source.end_thread()
 
 
+def test_a_loop_that_is_late_is_told_the_first_of_several_errors(camera: HandCamera) -> None:
+    class Failing(HandCamera):
+        asked = 0
+
+        def latest(self, max_age_s: float | None = None) -> Stamped[Frame]:
+            self.asked += 1
+            if self.asked > 1:
+                raise DeviceGone("camera", "unplugged" if self.asked == 2 else "is FAULTED")
+            return super().latest()
+
+    failing = Failing()
+    source = ContactPipeline(failing, NotingModel())  # type: ignore[arg-type]
+    source.begin_thread("perceives it")
+    eventually(lambda: failing.asked > 3)
+    source.update(0)
+    with pytest.raises(DeviceGone, match="unplugged"):
+        source.update(0)
+    source.end_thread()
+
+
 def test_a_first_frame_that_fails_fails_the_start(camera: HandCamera) -> None:
     camera.shown = DeviceGone("camera", "unplugged")
     source = ContactPipeline(camera, NotingModel())  # type: ignore[arg-type]

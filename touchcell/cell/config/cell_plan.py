@@ -241,7 +241,7 @@ class CellFile(_Section):
         rate_hz: control cycles per second.
         processes: ``separate`` runs devices in processes of their own with a watchdog, in real time only.
         perceive_in: where camera frames become contacts: the ``loop``'s thread, or ``threads`` of their own, one for
-            each sensor; ``auto`` takes threads where the frames of all sensors together, at 4 ms each, take more than
+            each sensor; ``auto`` takes threads where the frames of all sensors together, at 6 ms each, take more than
             half of a cycle. Simulated cameras are always read in the loop's thread.
         seed: of everything random, from 0 on.
         max_duration_s: longest run; it is stopped then.

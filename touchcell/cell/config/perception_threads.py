@@ -7,8 +7,8 @@ from typing import Final
 
 from touchcell.cell.config.cell_plan import CellFile, CellPlan, DevicePlan
 
-FRAME_S: Final = 4e-3
-"""What an estimate from a camera frame takes, decoding included: median of docs/benchmarks/sensors.txt, rounded up."""
+FRAME_S: Final = 6e-3
+"""What an estimate from a camera frame takes, decoding included: 3.7 to 5.8 ms in docs/benchmarks/sensors.txt."""
 
 SHARE: Final = 0.5
 """Part of a cycle that perception may take before it gets threads of its own."""
@@ -28,7 +28,7 @@ def threaded_sensors(cell: CellFile, sensors: Mapping[str, DevicePlan]) -> froze
     able = _able(cell, sensors)
     if cell.perceive_in == "loop":
         return frozenset()
-    if cell.perceive_in == "threads" or len(able) * FRAME_S * cell.rate_hz > SHARE:
+    if cell.perceive_in == "threads" or len(able) * FRAME_S > SHARE * _cycle_s(cell):
         return able
     return frozenset()
 
@@ -44,8 +44,13 @@ def perception_line(plan: CellPlan) -> str:
     if cell.perceive_in != "auto":
         return f"{where}, as perceive_in says"
     takes = f"{len(able)} frame{'s' if len(able) > 1 else ''} of {1e3 * FRAME_S:g} ms"
-    more = "more" if len(able) * FRAME_S * cell.rate_hz > SHARE else "no more"
-    return f"{where}: {takes}, {more} than half of a cycle of {1e3 / cell.rate_hz:g} ms"
+    more = "more" if len(able) * FRAME_S > SHARE * _cycle_s(cell) else "no more"
+    return f"{where}: {takes}, {more} than half of a cycle of {1e3 * _cycle_s(cell):g} ms"
+
+
+def _cycle_s(cell: CellFile) -> float:
+    """Return the machine's time for a cycle."""
+    return 1.0 / (cell.rate_hz * (cell.emulated_pace if cell.world == "emulated" else 1.0))
 
 
 def _able(cell: CellFile, sensors: Mapping[str, DevicePlan]) -> frozenset[str]:

@@ -12,6 +12,7 @@ import numpy as np
 
 from touchcell.cell.config.armed import require_armed
 from touchcell.cell.config.cell_plan import REDUCED_SPEED_M_S, CellPlan
+from touchcell.cell.config.perception_threads import threaded_sensors
 from touchcell.cell.config.planning_scene import build_planning_scene
 from touchcell.cell.recording.dataset_writer import Collection
 from touchcell.cell.recording.frame_compressor import require_video
@@ -53,7 +54,7 @@ def compose(
 
     Args:
         plan: a checked cell file.
-        clock: in place of the one that the file asks for.
+        clock: in place of the one that the file asks for; frames are then processed in the loop.
         enabling_device: for a cell with ``enabling_device: external``.
         jog_input: operator input of the task ``jog``.
         arrange: returns the interlocks to use in place of the cell's own, which are proven to be armed all the same:
@@ -72,8 +73,11 @@ def compose(
     wanted = {name: device for name, device in plan.built.items() if name not in world.hosted}
     devices = build_devices(plan, wanted, world.clock, world.scene, world.hosted)
     arms = {role: cast(Arm, devices[name]) for name, role in role_of.items()}
+    # A clock of the caller's may stand still, and a thread would wait for it.
+    threaded = threaded_sensors(plan.cell, plan.sensors) if clock is None else frozenset()
     sensors = {
-        role: build_sensor(plan, name, devices, world.truth, role_of) for role, name in plan.sensor_roles.items()
+        role: build_sensor(plan, name, devices, world.truth, role_of, threaded=name in threaded)
+        for role, name in plan.sensor_roles.items()
     }
     sensor_poses = {role: sensor.T_tcp_sensor for role, sensor in sensors.items()}
     planning_scene = build_planning_scene(plan, arms, {role: name for name, role in role_of.items()})

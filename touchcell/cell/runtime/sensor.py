@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from touchcell.cell.config.cell_plan import CellPlan
-from touchcell.cell.config.perception_threads import threaded_sensors
 from touchcell.cell.recording.messages import belief_message, pose_message
 from touchcell.drivers.core.device import Device
 from touchcell.drivers.core.protocols import FrameSource
@@ -126,7 +125,13 @@ class Sensor:
 
 
 def build_sensor(
-    plan: CellPlan, name: str, devices: Mapping[str, Device], scene: SceneTruth | None, role_of: Mapping[str, str]
+    plan: CellPlan,
+    name: str,
+    devices: Mapping[str, Device],
+    scene: SceneTruth | None,
+    role_of: Mapping[str, str],
+    *,
+    threaded: bool = False,
 ) -> Sensor:
     """One sensor of ``plan``, reading its device.
 
@@ -136,6 +141,7 @@ def build_sensor(
         devices: by name; at least its camera and the arm that carries it.
         scene: what is simulated around it, which its true contact comes from.
         role_of: roles of the arms in the task, by name.
+        threaded: whether its frames are processed in a thread of their own.
 
     Raises:
         ModelError: its model file cannot be used.
@@ -154,7 +160,7 @@ def build_sensor(
         true_edge=edge,
         frames=plan.cell.recording.frames,
         watched=any(interlock.kind in ("frame_frozen", "exposure") for interlock in plan.cell.interlocks.values()),
-        threaded=name in threaded_sensors(plan.cell, plan.sensors),
+        threaded=threaded,
     )
 
 

@@ -6,7 +6,9 @@ filter, needs the sensor's pose at the time of the frame and takes a tenth of th
 
 from __future__ import annotations
 
+import math
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -23,7 +25,10 @@ from touchcell.perception.models.preprocessing import Preprocessing
 from touchcell.perception.runtime.contact_gate import ContactGate
 from touchcell.perception.runtime.zero import ZeroFrame
 
-_POLL_S, _AFTER_FAILURE_S = 1e-3, 20e-3
+_POLL_S, _AFTER_FAILURE_S = 2e-3, 20e-3
+_REST: Final = 0.8
+"""Part of the time between frames in which a camera is not asked: each time costs a call of the system, or more."""
+
 _KEPT: Final = 8
 """Frames that wait for the loop; where it is later than that, the oldest are dropped."""
 
@@ -205,11 +210,21 @@ class ThreadedStage:
             return self._stage.take_zero()
 
     def _run(self) -> None:
-        pause_s = _POLL_S
+        pause_s, period_s, newest_ns = _POLL_S, math.inf, None
         while not self._finished.wait(pause_s) and not self._stage.ended:
+            began_s, pause_s = time.monotonic(), _POLL_S
             try:
                 with self._at_work:
-                    self._seen.extend(self._stage.new())
-                pause_s = _POLL_S
+                    new = self._stage.new()
+                    self._seen.extend(new)
             except BaseException as error:
-                self._failure, pause_s = error, _AFTER_FAILURE_S
+                # The first tells what happened; those after it say that the device has failed.
+                self._failure, pause_s = self._failure or error, _AFTER_FAILURE_S
+                continue
+            for seen in new:
+                if newest_ns is not None:
+                    # A frame that was missed doubles the time once; a camera that has become slower is found out.
+                    period_s = min(1e-9 * (seen.frame.t_ns - newest_ns), 1.1 * period_s)
+                newest_ns = seen.frame.t_ns
+                if math.isfinite(period_s):
+                    pause_s = max(_POLL_S, _REST * period_s - (time.monotonic() - began_s))
