@@ -3,13 +3,14 @@
 First, numbers of the dynamic scene against theory. Second, scripted contacts at every fidelity against MuJoCo at
 0.1 ms. Third, whole cells in closed loop, dynamic ones commanded every 5 ms: simulated seconds per second of one core,
 and its CPU time by part. Times are CPU times, not wall times, because cores are shared; other load still makes them
-longer. ``--quick`` runs the first script and the first cell only.
+longer. ``--quick`` runs the first script and the first cell only, ``--mesh`` a cell on a mesh several times.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
@@ -37,6 +38,7 @@ from touchcell.simulation.scene import SceneConfig
 
 _FINEST_MS = 0.1
 _DYNAMIC_GRID_MS = 5.0
+_MESH_REPETITIONS = 8
 _CELLS = (
     "surface_follow_sim",
     "surface_mesh_sim",
@@ -89,9 +91,10 @@ def run(arguments: Sequence[str], out: Path) -> None:
     parser = argparse.ArgumentParser(prog="touchcell bench simulation")
     parser.add_argument("--quick", action="store_true", help="the first script and the first cell only")
     parser.add_argument("--yaw", action="store_true", help="how blocks turn in quasi-static physics, and nothing else")
+    parser.add_argument("--mesh", action="store_true", help="speed on a mesh without images, eight times, and no more")
     options = parser.parse_args(arguments)
-    if options.yaw:
-        _yaw(out)
+    if options.yaw or options.mesh:
+        (_yaw if options.yaw else _mesh)(out)
         return
     quick = options.quick
     scripts = dict(list(SCRIPTS.items())[: 1 if quick else None])
@@ -115,6 +118,25 @@ def _yaw(out: Path) -> None:
     lines = [f"{each.what:<72}{each.value:>32}  {each.aim:<12}{'' if each.passed else 'MISSED'}" for each in found]
     text = [f"{key}: {value}" for key, value in provenance().items()]
     (out / "simulation_yaw.txt").write_text("\n".join([*text, "", *lines]) + "\n")
+    print("\n".join(lines))
+
+
+def _mesh(out: Path) -> None:
+    """Print simulated seconds per CPU second of a saddle followed as a mesh; write ``simulation_mesh.txt``."""
+    (name,) = _MESHES
+    data = yaml.safe_load(_cell_file(name).read_text())
+    data["scene"]["surfaces"] = _MESHES[name]
+    found = [
+        float(_speed(data, "kinematic", images=False, out=out)["times_real_time"]) for _ in range(_MESH_REPETITIONS)
+    ]
+    about = "; ".join(f"{key} {value}" for key, value in provenance().items())
+    lines = [
+        f"touchcell bench simulation --mesh; {about}; load {os.getloadavg()[0]:.1f}",
+        f"{name} on {Path(_MESHES[name]['saddle']['file']).name}, kinematic, without images: simulated s per CPU s",
+        "runs:  " + "  ".join(f"{each:.1f}" for each in found),
+        f"mean {np.mean(found):.1f}, median {np.median(found):.1f}, aim >= 20",
+    ]
+    (out / "simulation_mesh.txt").write_text("\n".join(lines) + "\n")
     print("\n".join(lines))
 
 

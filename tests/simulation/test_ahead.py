@@ -58,6 +58,8 @@ def test_no_other_start_is_found_where_the_given_one_will_do() -> None:
         ((48.0, 0.0, 45.0, 180.0, 0.0, 0.0), None),
         ((30.0, 0.0, 45.0, 180.0, 0.0, 0.0), "the tip comes down 20 mm inside the nearest edge"),
         ((48.0, 0.0, 45.0, 180.0, 0.0, 90.0), "the tip comes down on an edge with its x axis turned by"),
+        ((48.0, 46.0, 45.0, 180.0, 0.0, 0.0), "the tip comes down at a corner; start along a side"),
+        ((42.0, 0.0, 43.0, 180.0, -18.0, 0.0), "the tip meets the face beside the edge at 18 deg"),
     ],
 )
 def test_a_contact_that_is_not_with_an_edge_is_named(start_mm_deg: tuple[float, ...], remark: str | None) -> None:
@@ -81,3 +83,13 @@ def test_the_edge_of_a_block_leads_once_around_it(step_m: float) -> None:
 def test_no_edge_is_followed_where_none_is_met() -> None:
     T_world_s = se3.from_euler_mm_deg(np.array([300.0, 0.0, 45.0, 180.0, 0.0, 0.0]))
     assert way_along_edge([SURFACES["block"]], T_world_s, 0.020, 0.050, 1.0, 0.004) is None
+
+
+def test_from_a_corner_a_start_along_a_side_is_advised_unless_it_is_not_allowed() -> None:
+    surfaces = {"block": SURFACES["block"]}
+    at_corner = se3.from_euler_mm_deg(np.array([48.0, 46.0, 45.0, 180.0, 0.0, 0.0]))
+    found = start_near(surfaces, at_corner, 0.020, 0.050, on_edge=True)
+    assert found is not None
+    assert remark_on_edge(list(surfaces.values()), found, 0.020, 0.050) is None
+    assert np.linalg.norm(found[:2, 3] - at_corner[:2, 3]) < 0.025
+    assert start_near(surfaces, at_corner, 0.020, 0.050, on_edge=True, allowed=lambda T_world_s: False) is None

@@ -10,7 +10,7 @@ from touchcell.simulation.contact import ContactLaw
 from touchcell.simulation.edge_samples import EdgeRanges, edge_contacts, frame_on_rim
 from touchcell.simulation.edge_ways import contacts_on_way
 from touchcell.simulation.meshes.mesh_shape import MeshShape
-from touchcell.simulation.random_parts import random_part
+from touchcell.simulation.random_parts import random_part, steep_part
 from touchcell.simulation.samples import SampledContact, Variation
 from touchcell.simulation.shape_samples import shape_contacts
 from touchcell.simulation.surfaces import Surface
@@ -64,6 +64,36 @@ def test_random_parts_have_an_edge_with_their_face_above_and_a_wall_below(seed: 
     face = normals[i, normals[i, :, 2].argmax()]
     middle = 0.5 * (edges.starts[i] + edges.ends[i])
     assert shape.nearest(middle + 0.017 * face).distance_m == pytest.approx(0.017, abs=2e-4)
+
+
+def test_steep_parts_spread_over_the_angles_of_rims_and_tell_the_normals_of_their_faces() -> None:
+    angles_deg = []
+    for seed in range(12):
+        part = steep_part(np.random.default_rng(seed))
+        assert part.normals is not None
+        shape = MeshShape(part, math.radians(30.0))
+        normals = shape.edges.middle_normals
+        rim = normals[:, :, 2].max(axis=1) > 0.64
+        cos = np.einsum("kc,kc->k", normals[rim, 0], normals[rim, 1])
+        angles_deg.append(180.0 - math.degrees(math.acos(np.clip(np.median(cos), -1.0, 1.0))))
+    assert min(angles_deg) < 75.0
+    assert max(angles_deg) > 115.0
+
+
+def test_no_contact_is_drawn_at_the_border_of_a_part_that_is_open_below() -> None:
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        shape = MeshShape(random_part(rng), math.radians(30.0))
+        surface = Surface(shape)
+        for _ in range(5):
+            T_world_e = frame_on_rim(shape, surface, 0.020, rng)
+            at = shape.edges.nearest(T_world_e[:3, 3] + 0.020 * T_world_e[:3, 2])
+            assert float(at.normals[0] @ at.normals[1]) < math.cos(math.radians(25.0))
+
+
+def test_a_longer_draw_begins_with_the_shorter_one() -> None:
+    one, two = list(edge_contacts(40, 3, part=steep_part)), list(edge_contacts(72, 3, part=steep_part))
+    assert all(np.array_equal(a.pixels, b.pixels) for a, b in zip(one, two[:40], strict=True))
 
 
 def test_contacts_on_ways_are_held_as_a_controller_holds_them_and_turn_far_at_corners() -> None:

@@ -28,8 +28,13 @@ _FARTHEST_M: Final = 0.5
 _INSIDE_M: Final = (0.0, 5e-3, 15e-3, 30e-3)
 """How far beyond the nearest point a start is moved across its axis: the nearest point may be on a silhouette."""
 _INSIDE_EDGE_M: Final = 8e-3
-_BEYOND_EDGE_M: Final = 5e-3
+_BEYOND_EDGE_M: Final = 2.5e-3
 _MOST_TURN_RAD: Final = math.radians(60.0)
+_MOST_LEAN_RAD: Final = math.radians(15.0)
+"""Between a tip that comes down and the face beside an edge: estimates of the tilt are checked at the first contact."""
+_BESIDE_CORNER_M: Final = 6e-3
+_CORNER_RAD: Final = math.radians(35.0)
+_ALONG_M: Final = 15e-3
 _AT_EDGE_MM_DEG: Final = np.array([-2.0, 0.0, -5.0, 0.0, 0.0, 0.0])
 _ON_FACE_M: Final = 0.5e-3
 """How far inside its edge a tip is moved along, so that at a corner the next edge is the nearer one."""
@@ -88,7 +93,27 @@ def remark_on_edge(surfaces: Sequence[Surface], T_world_s: Array, tip_radius_m: 
             f"the tip comes down on an edge with its x axis turned by {math.degrees(turn):.0f} deg from the way across "
             "it, away from the face"
         )
+    lean = math.acos(min(max(float(T_world_e[:3, 2] @ T_world_s[:3, 2]), -1.0), 1.0))
+    if lean > _MOST_LEAN_RAD:
+        return (
+            f"the tip meets the face beside the edge at {math.degrees(lean):.0f} deg; "
+            "turn the start pose towards it, or start where the face lies across the tip"
+        )
+    if _is_at_corner(surfaces, T_world_e, tip_radius_m):
+        return "the tip comes down at a corner; start along a side"
     return None
+
+
+def _is_at_corner(surfaces: Sequence[Surface], T_world_e: Array, tip_radius_m: float) -> bool:
+    """Return whether an edge turns a corner close to the frame {e} (4, 4)."""
+    for aside_m in (-_BESIDE_CORNER_M, _BESIDE_CORNER_M):
+        ahead = np.eye(4)
+        ahead[:2, 3] = -_ON_FACE_M, aside_m
+        T = nearest_edge(surfaces, se3.compose(T_world_e, ahead), 0.0, tip_radius_m)
+        assert T is not None
+        if float(T[:3, 0] @ T_world_e[:3, 0]) < math.cos(_CORNER_RAD):
+            return True
+    return False
 
 
 def way_along_edge(
@@ -163,9 +188,22 @@ def start_near(
             if T_world_e is None:
                 continue
             T = se3.compose(T_world_e, se3.from_euler_mm_deg(_AT_EDGE_MM_DEG))
-        if is_good(T) and allowed(T):
-            return T
+        for candidate in (T, *(_along_edge(bodies, T, tip_radius_m) if on_edge else ())):
+            if is_good(candidate) and allowed(candidate):
+                return candidate
     return None
+
+
+def _along_edge(surfaces: Sequence[Surface], T_world_s: Array, tip_radius_m: float) -> Iterator[Array]:
+    """Yield starts farther along the edge that a start is at, to either side."""
+    T_world_e = nearest_edge(surfaces, T_world_s, 0.0, tip_radius_m)
+    assert T_world_e is not None
+    for aside_m in (-_ALONG_M, _ALONG_M):
+        ahead = np.eye(4)
+        ahead[:2, 3] = -_ON_FACE_M, aside_m
+        T = nearest_edge(surfaces, se3.compose(T_world_e, ahead), 0.0, tip_radius_m)
+        assert T is not None
+        yield se3.compose(T, se3.from_euler_mm_deg(_AT_EDGE_MM_DEG))
 
 
 def _other_starts(surfaces: Mapping[str, Surface], T_world_s: Array, tip_radius_m: float) -> Iterator[Array]:

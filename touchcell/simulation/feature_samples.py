@@ -21,7 +21,7 @@ from touchcell.simulation.edge_samples import EdgeRanges, dragged_to, frame_on_r
 from touchcell.simulation.edges import nearest_edge
 from touchcell.simulation.meshes.mesh_shape import MeshShape
 from touchcell.simulation.pressed import pressed
-from touchcell.simulation.random_parts import random_part
+from touchcell.simulation.random_parts import random_part, steep_part
 from touchcell.simulation.samples import Variation, scattered
 from touchcell.simulation.shape_samples import random_curved_surface
 from touchcell.simulation.surfaces import Surface
@@ -29,6 +29,7 @@ from touchcell.simulation.tip import Tip, TipParameters
 
 _CONTACTS_PER_TIP: Final = 32
 _CREASE_RAD: Final = math.radians(30.0)
+_STEEP: Final = 0.3
 _ON_EDGE_M: Final = 4e-3
 _AT_CORNER_M: Final = 4e-3
 _OFF_CORNER_M: Final = 8e-3
@@ -45,7 +46,7 @@ def feature_contacts(n: int, seed: int, *, variation: Variation | None = None) -
     variation, law = variation or Variation(), ContactLaw()
     for start in range(0, n, _CONTACTS_PER_TIP):
         tip = Tip(scattered(TipParameters(), variation, rng))
-        part = MeshShape(random_part(rng), _CREASE_RAD)
+        part = MeshShape((steep_part if rng.random() < _STEEP else random_part)(rng), _CREASE_RAD)
         surface, corners = Surface(part), _corners(part)
         smooth = random_curved_surface(rng)
         for _ in range(min(_CONTACTS_PER_TIP, n - start)):

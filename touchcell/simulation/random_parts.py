@@ -10,7 +10,7 @@ import numpy as np
 
 from touchcell.geometry.types import Array
 from touchcell.simulation.meshes.primitives import grid_faces
-from touchcell.simulation.meshes.smoothing import TriangleMesh
+from touchcell.simulation.meshes.smoothing import Indices, TriangleMesh
 
 _WALL_M: Final = 25e-3
 _INWARDS_M: Final = (0.0, 2e-3, 5e-3, 9e-3, 14e-3, 20e-3, 28e-3, 40e-3)
@@ -159,13 +159,14 @@ def _normals(heights: Callable[[Array], Array], points: Array) -> Array:
     """Return (n, 3) upward unit normals at points (n, 2) m."""
     steps = _DIFFERENCE_M * np.eye(2)
     slopes = [(heights(points + step) - heights(points - step)) / (2.0 * _DIFFERENCE_M) for step in steps]
-    normals = np.stack([-slopes[0], -slopes[1], np.ones(len(points))], axis=1)
-    return normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    normals: Array = np.stack([-slopes[0], -slopes[1], np.ones(len(points))], axis=1)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    return normals
 
 
-def _told(of_vertices: Array, faces: Array) -> Array:
+def _told(of_vertices: Array, faces: Indices) -> Array:
     """Return (m, 3, 3) normals at the corners of triangles that lie on the face, NaN for the others."""
-    corners = of_vertices[faces]
+    corners: Array = of_vertices[faces]
     corners[~np.isfinite(corners).all(axis=(1, 2))] = np.nan
     return corners
 

@@ -37,7 +37,8 @@ class SimRecipe:
 
 
 PRESETS: Final = {
-    "sim_edge": SimRecipe(samples=144_000, kind="markers", epochs=16, feature="edge"),
+    "sim_edge": SimRecipe(samples=192_000, kind="markers", epochs=10, feature="edge"),
+    "sim_kinds": SimRecipe(samples=20_000, epochs=20, feature="kinds"),
     "sim_shape": SimRecipe(samples=40_000, kind="markers", epochs=20, feels="shape"),
 }
 """How the models of these names were made."""

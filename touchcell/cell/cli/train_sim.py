@@ -82,7 +82,7 @@ DETAIL_SETTINGS: Final[dict[str, Any]] = {
 }
 """Edges and tilts are told by tenths of a pixel (docs/decisions/0051-edges-in-detail.md)."""
 
-_STEEP: Final = 2.0 / 7.0
+_STEEP: Final = 0.25
 """Of the contacts with edges, on parts of what is rare among random ones."""
 _STEEP_SEED: Final = 500_000
 _OTHER_SEED: Final = 1_000_000
@@ -186,8 +186,9 @@ def _train_markers(
 
     settings = MarkerSettings(seed=seed)
     if imagined.of_shapes:
-        # One network in a file of 4 MB, which can ship. Its sensors scatter already, by what a camera is remounted.
-        settings = replace(settings, hidden=(384, 384, 256), networks=1, **DETAIL_SETTINGS)
+        # One network in a file of 5 MB, which can ship. Its sensors scatter already, by what a camera is remounted.
+        hidden = (512, 512, 256) if imagined.feature == "edge" else (384, 384, 256)
+        settings = replace(settings, hidden=hidden, networks=1, **DETAIL_SETTINGS)
     train_on_discs(
         _discs(imagined, samples, seed),
         _discs(imagined, _for_validation(samples), seed + _OTHER_SEED),

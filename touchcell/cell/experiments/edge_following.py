@@ -40,7 +40,7 @@ MODES: Final[dict[str, tuple[str, dict[str, Any]]]] = {
     ),
 }
 """Other ways of following than once around in five dimensions: the row's name, the shape and changes of the cell."""
-_SAMPLED: Final = ("circle", "square", "clover")
+_SAMPLED: Final = ("circle", "square", "clover", "bowl")
 _QUICK: Final = ("circle", "square")
 _HEIGHT_MM: Final = 20.0
 _RIM_MM: Final = 45.0
