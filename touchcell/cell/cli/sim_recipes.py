@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final, Literal, TypeAlias
+from typing import TYPE_CHECKING, Final, Literal, TypeAlias
 
-from touchcell.perception.runtime.estimator_spec import Feature
+if TYPE_CHECKING:
+    from touchcell.perception.runtime.estimator_spec import Feature
 
 Feels: TypeAlias = Literal["plane", "shape"]
 """What surfaces are made of."""
