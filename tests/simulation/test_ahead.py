@@ -59,7 +59,6 @@ def test_no_other_start_is_found_where_the_given_one_will_do() -> None:
         ((30.0, 0.0, 45.0, 180.0, 0.0, 0.0), "the tip comes down 20 mm inside the nearest edge"),
         ((48.0, 0.0, 45.0, 180.0, 0.0, 90.0), "the tip comes down on an edge with its x axis turned by"),
         ((48.0, 46.0, 45.0, 180.0, 0.0, 0.0), "the tip comes down at a corner; start along a side"),
-        ((42.0, 0.0, 43.0, 180.0, -18.0, 0.0), "the tip meets the face beside the edge at 18 deg"),
     ],
 )
 def test_a_contact_that_is_not_with_an_edge_is_named(start_mm_deg: tuple[float, ...], remark: str | None) -> None:

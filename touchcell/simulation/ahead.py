@@ -30,8 +30,6 @@ _INSIDE_M: Final = (0.0, 5e-3, 15e-3, 30e-3)
 _INSIDE_EDGE_M: Final = 8e-3
 _BEYOND_EDGE_M: Final = 2.5e-3
 _MOST_TURN_RAD: Final = math.radians(60.0)
-_MOST_LEAN_RAD: Final = math.radians(15.0)
-"""Between a tip that comes down and the face beside an edge: estimates of the tilt are checked at the first contact."""
 _BESIDE_CORNER_M: Final = 6e-3
 _CORNER_RAD: Final = math.radians(35.0)
 _ALONG_M: Final = 15e-3
@@ -92,12 +90,6 @@ def remark_on_edge(surfaces: Sequence[Surface], T_world_s: Array, tip_radius_m: 
         return (
             f"the tip comes down on an edge with its x axis turned by {math.degrees(turn):.0f} deg from the way across "
             "it, away from the face"
-        )
-    lean = math.acos(min(max(float(T_world_e[:3, 2] @ T_world_s[:3, 2]), -1.0), 1.0))
-    if lean > _MOST_LEAN_RAD:
-        return (
-            f"the tip meets the face beside the edge at {math.degrees(lean):.0f} deg; "
-            "turn the start pose towards it, or start where the face lies across the tip"
         )
     if _is_at_corner(surfaces, T_world_e, tip_radius_m):
         return "the tip comes down at a corner; start along a side"
@@ -188,10 +180,17 @@ def start_near(
             if T_world_e is None:
                 continue
             T = se3.compose(T_world_e, se3.from_euler_mm_deg(_AT_EDGE_MM_DEG))
-        for candidate in (T, *(_along_edge(bodies, T, tip_radius_m) if on_edge else ())):
+            kept = _as_tilted(T_world_e, T_world_s[:3, 2])
+        for candidate in (kept, T, *_along_edge(bodies, T, tip_radius_m)) if on_edge else (T,):
             if is_good(candidate) and allowed(candidate):
                 return candidate
     return None
+
+
+def _as_tilted(T_world_e: Array, axis: Array) -> Array:
+    """Return the start (4, 4) at an edge of a tip that keeps the axis (3,), as one that is never tilted has to."""
+    p = T_world_e[:3, 3] + 1e-3 * _AT_EDGE_MM_DEG[0] * T_world_e[:3, 0]
+    return _at(_turned(T_world_e[:3, :3], -axis), p - (_START_M + _TURNED_M) * axis)
 
 
 def _along_edge(surfaces: Sequence[Surface], T_world_s: Array, tip_radius_m: float) -> Iterator[Array]:
