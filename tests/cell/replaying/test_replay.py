@@ -96,8 +96,8 @@ def test_another_speed_changes_twists_and_no_estimate(with_images: Path, tmp_pat
     found = by_name(differences(done, EXACT))
     assert found["contact of sensor"].agrees
     apart = found["twist of arm"].linear
-    # Single cycles in which the speed changes fast are up to the limit of acceleration.
-    assert np.median(apart[apart > 1.0]) == pytest.approx(6.0, abs=0.2)
+    # While the speed changes, and where it turns with the surface, cycles differ by more or less.
+    assert np.median(apart[apart > 1.0]) == pytest.approx(6.0, abs=0.3)
     assert apart.max() < 7.0
     assert len(found["twist of arm"].beyond)
 
