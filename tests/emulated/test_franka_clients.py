@@ -86,6 +86,7 @@ def test_franky_reports_reflexes_and_recovers(emulated: Emulated, robot: franky.
     assert robot.state.robot_mode == franky.RobotMode.Reflex
     assert robot.state.O_F_ext_hat_K[0] == pytest.approx(-35)
     emulated.process.clear("external_wrench")
+    eventually(lambda: abs(robot.state.O_F_ext_hat_K[0]) < 1.0)
     assert robot.recover_from_errors()
     assert robot.state.robot_mode == franky.RobotMode.Idle
     robot.move(franky.CartesianVelocityMotion(franky.Twist([0.03, 0, 0]), duration=franky.Duration(100)))
