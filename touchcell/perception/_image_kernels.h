@@ -265,7 +265,7 @@ static int threshold(const uint8_t *image, ptrdiff_t row_bytes, ptrdiff_t height
                 middle[x] = (uint16_t)(middle[x] + row[x]);
         }
         for (ptrdiff_t y = 0; y < height; y++) {
-            const uint8_t *in = row_at(&rows, y + half), *pixels;
+            const uint8_t *in = row_at(&rows, y + half), *pixels = row_at(&rows, y);
             roll_columns(middle, in, row_at(&rows, y - half - 1), width);
             for (ptrdiff_t x = 0; x < half; x++) {
                 columns[x] = middle[0];
@@ -275,7 +275,6 @@ static int threshold(const uint8_t *image, ptrdiff_t row_bytes, ptrdiff_t height
             for (ptrdiff_t x = 0; x < block; x++)
                 sum += columns[x];
             ptrdiff_t from = 0;
-            pixels = row_at(&rows, y);
 #if INTEL
             if (wide)
                 from = above_mean_by_32(pixels, columns, block, &sum, with, width, to + y * width);

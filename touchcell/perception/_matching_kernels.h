@@ -306,6 +306,19 @@ static double median_of(double *values, ptrdiff_t count)
     return 0.5 * (lower + values[middle]);
 }
 
+/* places = base + basis * coefficients. 0: out of memory. */
+static int place_markers(const Modes *modes, const double *base, const double *coefficients, double *places)
+{
+    double *padded = calloc((size_t)modes->stride, sizeof *padded);
+    if (!padded)
+        return 0;
+    memcpy(padded, coefficients, (size_t)modes->modes * sizeof *padded);
+    memcpy(places, base, 2 * (size_t)modes->markers * sizeof *places);
+    shift_places(modes, padded, places);
+    free(padded);
+    return 1;
+}
+
 /* When pairing and fitting by turns ends. */
 typedef struct {
     double reach_px, least_reach_px, settled_px;
@@ -321,19 +334,16 @@ static int settle(const Modes *modes, const double *base, const double *start, c
                   const Buckets *points, ptrdiff_t count, Settling settling, double *coefficients)
 {
     ptrdiff_t m = modes->markers, k = modes->modes, stride = modes->stride;
-    double *room = calloc((size_t)(7 * m + room_of_fit(modes) + 3 * stride), sizeof *room);
+    double *room = calloc((size_t)(7 * m + room_of_fit(modes) + 2 * stride), sizeof *room);
     int64_t *partner = malloc((size_t)m * sizeof *partner);
     int32_t *owner = malloc((size_t)count * sizeof *owner);
     uint8_t *owns = malloc((size_t)m);
-    int done = room && partner && owner && owns;
+    double *places = room;
+    int done = room && partner && owner && owns && place_markers(modes, base, coefficients, places);
     if (done) {
-        double *places = room, *off = places + 2 * m, *square = off + 2 * m, *weight = square + m;
-        double *paired_squares = weight + m, *change = paired_squares + m, *from_start = change + stride;
-        double *padded = from_start + stride, *fit_room = padded + stride;
+        double *off = places + 2 * m, *square = off + 2 * m, *weight = square + m, *paired_squares = weight + m;
+        double *change = paired_squares + m, *from_start = change + stride, *fit_room = from_start + stride;
         double reach = settling.reach_px;
-        memcpy(places, base, 2 * (size_t)m * sizeof *places);
-        memcpy(padded, coefficients, (size_t)k * sizeof *padded);
-        shift_places(modes, padded, places);
         for (int turn = 0; turn < settling.turns; turn++) {
             ptrdiff_t paired = 0;
             double soft = 0.35 * reach;
@@ -366,19 +376,6 @@ static int settle(const Modes *modes, const double *base, const double *start, c
     free(owner);
     free(owns);
     return done;
-}
-
-/* places = base + basis * coefficients. 0: out of memory. */
-static int place_markers(const Modes *modes, const double *base, const double *coefficients, double *places)
-{
-    double *padded = calloc((size_t)modes->stride, sizeof *padded);
-    if (!padded)
-        return 0;
-    memcpy(padded, coefficients, (size_t)modes->modes * sizeof *padded);
-    memcpy(places, base, 2 * (size_t)modes->markers * sizeof *places);
-    shift_places(modes, padded, places);
-    free(padded);
-    return 1;
 }
 
 /* Squared distances from their nearest points of some markers, the first and then each `step`. */

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import chain
 from typing import Final
 
 import numpy as np
@@ -99,13 +100,19 @@ def remark_on_edge(surfaces: Sequence[Surface], T_world_s: Array, tip_radius_m: 
 def _is_at_corner(surfaces: Sequence[Surface], T_world_e: Array, tip_radius_m: float) -> bool:
     """Return whether an edge turns a corner close to the frame {e} (4, 4)."""
     for aside_m in (-_BESIDE_CORNER_M, _BESIDE_CORNER_M):
-        ahead = np.eye(4)
-        ahead[:2, 3] = -_ON_FACE_M, aside_m
-        T = nearest_edge(surfaces, se3.compose(T_world_e, ahead), 0.0, tip_radius_m)
-        assert T is not None
+        T = _farther_along(surfaces, T_world_e, aside_m, tip_radius_m)
         if float(T[:3, 0] @ T_world_e[:3, 0]) < math.cos(_CORNER_RAD):
             return True
     return False
+
+
+def _farther_along(surfaces: Sequence[Surface], T_world_e: Array, step_m: float, tip_radius_m: float) -> Array:
+    """Return the frame {e} (4, 4) of the edge that is nearest to a place farther along the y axis of one."""
+    ahead = np.eye(4)
+    ahead[:2, 3] = -_ON_FACE_M, step_m
+    T = nearest_edge(surfaces, se3.compose(T_world_e, ahead), 0.0, tip_radius_m)
+    assert T is not None
+    return T
 
 
 def way_along_edge(
@@ -131,11 +138,8 @@ def way_along_edge(
     if T_world_e is None:
         return None
     way = [T_world_e]
-    ahead = np.eye(4)
-    ahead[:2, 3] = -_ON_FACE_M, step_m
     for _ in range(math.ceil(distance_m / abs(step_m))):
-        T_world_e = nearest_edge(surfaces, se3.compose(T_world_e, ahead), 0.0, tip_radius_m)
-        assert T_world_e is not None
+        T_world_e = _farther_along(surfaces, T_world_e, step_m, tip_radius_m)
         way.append(T_world_e)
         if len(way) > _FEWEST_OF_LOOP and float(np.linalg.norm((way[-1] - way[0])[:3, 3])) < abs(step_m):
             break
@@ -181,7 +185,7 @@ def start_near(
                 continue
             T = se3.compose(T_world_e, se3.from_euler_mm_deg(_AT_EDGE_MM_DEG))
             kept = _as_tilted(T_world_e, T_world_s[:3, 2])
-        for candidate in (kept, T, *_along_edge(bodies, T, tip_radius_m)) if on_edge else (T,):
+        for candidate in chain((kept, T), _along_edge(bodies, T, tip_radius_m)) if on_edge else (T,):
             if is_good(candidate) and allowed(candidate):
                 return candidate
     return None
@@ -198,10 +202,7 @@ def _along_edge(surfaces: Sequence[Surface], T_world_s: Array, tip_radius_m: flo
     T_world_e = nearest_edge(surfaces, T_world_s, 0.0, tip_radius_m)
     assert T_world_e is not None
     for aside_m in (-_ALONG_M, _ALONG_M):
-        ahead = np.eye(4)
-        ahead[:2, 3] = -_ON_FACE_M, aside_m
-        T = nearest_edge(surfaces, se3.compose(T_world_e, ahead), 0.0, tip_radius_m)
-        assert T is not None
+        T = _farther_along(surfaces, T_world_e, aside_m, tip_radius_m)
         yield se3.compose(T, se3.from_euler_mm_deg(_AT_EDGE_MM_DEG))
 
 
