@@ -12,6 +12,7 @@ from touchcell.geometry.types import Array
 
 FRAME_NS = 33_000_000
 STEP_NS = 11_000_000
+UNSEEN_M = 0.07e-3
 
 
 def contact(depth_m: float) -> Array:
@@ -41,7 +42,7 @@ def approach(zero: TouchZero, at_m: float, read: float, misread_m: float, late_n
         depth_m = min(max(exposed_m - at_m, 0.0), gives_way_m)
         touched = contact(read * depth_m + misread_m) if depth_m > 0.3e-3 else None
         # Stamped as if it had come without delay.
-        zero.saw(t_ns, seq, 0.004 if depth_m == 0.0 else 90.0 * depth_m, touched)
+        zero.saw(t_ns, seq, max(0.004, 90.0 * (depth_m - UNSEEN_M)), touched)
 
 
 @given(st.floats(3e-3, 8e-3), st.floats(0.92, 1.05), st.floats(-0.5e-3, 0.5e-3), st.sampled_from([0, 9, 18, 27]))
@@ -101,6 +102,6 @@ def test_what_shear_changes_of_the_image_counts_for_no_depth() -> None:
             T[0, 3], T[2, 3] = aside_m, advance_m
             zero.moved((3 * seq + step) * STEP_NS, T)
         depth_m = max(advance_m - 5.4e-3, 0.0)
-        change = 100.0 * depth_m + (60.0 * aside_m if depth_m else 0.0)
+        change = max(0.0, 100.0 * (depth_m - UNSEEN_M)) + (60.0 * aside_m if depth_m else 0.0)
         zero.saw((3 * seq + 2) * STEP_NS, seq, change, contact(depth_m + read_m) if depth_m > 0.4e-3 else None)
     assert zero.error_m == pytest.approx(read_m, abs=0.05e-3)

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections import deque
 from itertools import pairwise
-from typing import Final
+from typing import Final, Protocol
 
 import numpy as np
 
@@ -21,6 +21,9 @@ _FIRST_CHANGE: Final = 0.012
 """Change from which a frame counts: less is noise ..."""
 LAST_CHANGE: Final = 0.2
 """... and to which: the change of deeper contacts is no straight line."""
+_UNSEEN_M: Final = 0.07e-3
+"""Depth at which the straight line of change over depth is zero: the first patches are too small to be seen, on the
+simulated tips that are fitted to a real sensor 0.06 to 0.10 mm."""
 _FEWEST: Final = 3
 _STRAIGHT: Final = 0.6
 """Share of the steepest growth of the change from which the object still rests."""
@@ -39,8 +42,35 @@ _WINDOW: Final = 3
 _SHORTEST_PRESS_M: Final = 0.4e-3
 _RESTING: Final = 0.8
 """... and the share of it by which it has to."""
-_LARGEST_M: Final = 1.5e-3
+LARGEST_M: Final = 1.5e-3
 """A larger error is none of the model's depth: something else has changed the image."""
+
+
+class DepthZero(Protocol):
+    """What tells how much a model misreads the depth of a contact."""
+
+    @property
+    def ended(self) -> bool:
+        """True once the error is known as well as it will be."""
+        ...
+
+    @property
+    def error_m(self) -> float | None:
+        """Depth that the model reads beyond what the arm's motion says; None while it is not known."""
+        ...
+
+    @property
+    def change_per_m(self) -> float | None:
+        """Change of the image per depth, while that is small; None while it is not known."""
+        ...
+
+    def moved(self, t_ns: int, T_base_sensor: Array) -> None:
+        """Take note of the sensor's pose (4, 4)."""
+        ...
+
+    def saw(self, t_frame_ns: int, seq: int, change: float, T_s_f: Array | None) -> None:
+        """Take a frame into account: how much it has changed, and the contact (4, 4) that a model reads in it alone."""
+        ...
 
 
 class TouchZero:
@@ -95,7 +125,7 @@ class TouchZero:
         if T_s_f is None:
             self.ended = True
             return
-        self._pressed.append((advance_m * float(T_s_f[2, 2]), _depth_m(T_s_f)))
+        self._pressed.append((advance_m * float(T_s_f[2, 2]), depth_of(T_s_f)))
         if len(self._pressed) <= _WINDOW:
             return
         (along0_m, depth0_m), (along_m, depth_m) = self._pressed[-1 - _WINDOW], self._pressed[-1]
@@ -106,7 +136,7 @@ class TouchZero:
             return
         (rest_m, read_m), touched_error_m = self._pressed[0], self._touched_error_m
         error_m = touched_error_m + (depth0_m - read_m) - (along0_m - rest_m)
-        if abs(error_m) < _LARGEST_M:
+        if abs(error_m) < LARGEST_M:
             self.error_m = error_m
 
     def _while_resting(self) -> list[tuple[float, float]]:
@@ -146,13 +176,14 @@ class TouchZero:
         if slope <= 0.0:
             return
         # The arm advances along the sensor's axis, and depth is along the normal.
-        depth_m = change / slope * float(T_s_f[2, 2])
-        error_m = _depth_m(T_s_f) - depth_m
-        if abs(error_m) < _LARGEST_M:
+        depth_m = (change / slope + _UNSEEN_M) * float(T_s_f[2, 2])
+        error_m = depth_of(T_s_f) - depth_m
+        if abs(error_m) < LARGEST_M:
             self.error_m = self._touched_error_m = error_m
             self.change_per_m = change / depth_m
-            self._pressed.append((advance_m * float(T_s_f[2, 2]), _depth_m(T_s_f)))
+            self._pressed.append((advance_m * float(T_s_f[2, 2]), depth_of(T_s_f)))
 
 
-def _depth_m(T_s_f: Array) -> float:
+def depth_of(T_s_f: Array) -> float:
+    """Return the depth, m, of a contact (4, 4)."""
     return max(0.0, -float(T_s_f[:3, 2] @ T_s_f[:3, 3]))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, replace
 from typing import Final
 
@@ -82,6 +82,7 @@ def contacts(
     law: ContactLaw | None = None,
     rig: MountModel | None = None,
     variation: Variation | None = None,
+    tips: Callable[[np.random.Generator], TipParameters] | None = None,
 ) -> Iterator[SampledContact]:
     """Yield ``n`` random contacts, the same for the same seed.
 
@@ -97,12 +98,13 @@ def contacts(
         law: slip of the tips.
         rig: mount model with its slip, in place of ``law``.
         variation: amount of variation.
+        tips: draws the sensor, in place of ``parameters``.
     """
     rng = np.random.default_rng(seed)
     middle, law, variation = parameters or TipParameters(), law or ContactLaw(), variation or Variation()
     for start in range(0, n, _IMAGES_PER_TIP):
         count = min(_IMAGES_PER_TIP, n - start)
-        tip = Tip(scattered(middle, variation, rng))
+        tip = Tip(scattered(middle if tips is None else tips(rng), variation, rng))
         poses = random_poses(count, rng, depth_mm)
         if rig is None:
             T_f_s = np.stack([contact_at(pose, law).T_f_s for pose in poses])

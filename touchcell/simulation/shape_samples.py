@@ -8,7 +8,7 @@ pose of the sensor in the surface frame {f} at the nearest point, as on a plane.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Final
 
 import numpy as np
@@ -41,17 +41,29 @@ _FARTHEST_M: Final = 30e-3
 
 
 def shape_contacts(
-    n: int, seed: int, *, depth_mm: tuple[float, float], variation: Variation | None = None
+    n: int,
+    seed: int,
+    *,
+    depth_mm: tuple[float, float],
+    variation: Variation | None = None,
+    tips: Callable[[np.random.Generator], TipParameters] | None = None,
 ) -> Iterator[SampledContact]:
     """Yield ``n`` random contacts with curved surfaces, the same for the same seed.
 
     Depth is uniform in ``depth_mm``, tilt in a 25 deg disc, shear up to 5 mm, torsion in +-5 deg; what the depth
     cannot hold slips, and the label is the remaining pose.
+
+    Args:
+        n: number of contacts.
+        seed: seed of all randomness.
+        depth_mm: smallest and largest depth.
+        variation: amount of variation about a sensor.
+        tips: draws the sensor; None for the default tip.
     """
     rng = np.random.default_rng(seed)
     variation, law = variation or Variation(), ContactLaw()
     for start in range(0, n, _IMAGES_PER_TIP):
-        tip = Tip(scattered(TipParameters(), variation, rng))
+        tip = Tip(scattered(TipParameters() if tips is None else tips(rng), variation, rng))
         surface = random_curved_surface(rng, ridges=_RIDGES)
         for _ in range(min(_IMAGES_PER_TIP, n - start)):
             T_f_s, pixels = _contact(surface, tip, law, depth_mm, rng)

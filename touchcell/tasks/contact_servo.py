@@ -11,7 +11,8 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat
 
 from touchcell.control.pid import PidGains
 from touchcell.control.servo import TactileServo
-from touchcell.control.touch_zero import LAST_CHANGE, TouchZero
+from touchcell.control.resting_depth import RestingDepth
+from touchcell.control.touch_zero import LAST_CHANGE, DepthZero, TouchZero
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 from touchcell.perception.features.feature_model import TouchedFeature
@@ -106,11 +107,11 @@ class NeedsFeature(Protocol):
 
 @runtime_checkable
 class Easing(Protocol):
-    """Behavior that may press less than its reference."""
+    """Behavior that may press less than its reference, or more."""
 
     @property
     def ease_m(self) -> float:
-        """Depth by which it presses less now."""
+        """Depth, as the model reads it, by which it presses less now."""
         ...
 
 
@@ -127,6 +128,11 @@ class Assuming(Protocol):
 @runtime_checkable
 class DepthAware(Protocol):
     """Behavior that needs the depth of its contact better than a model reads it."""
+
+    @property
+    def surface_rests(self) -> bool:
+        """True if what it touches cannot give way before it runs."""
+        ...
 
     def correct_depth(self, error_m: float) -> None:
         """Take note that a model reads a depth which is larger by ``error_m`` than the arm's own motion says."""
@@ -255,7 +261,7 @@ class ContactServo:
         self.feature_run = run if isinstance(run, NeedsFeature) else None
         self._easing_run = run if isinstance(run, Easing) else None
         self._depth_run = run if isinstance(run, DepthAware) else None
-        self._touch_zero: TouchZero | None = None
+        self._touch_zero: DepthZero | None = None
         self._change_per_m: float | None = None
         self._config = config
         self._T_tcp_sensor = context.T_tcp_sensor[sensor]
@@ -407,7 +413,7 @@ class ContactServo:
         if self._touch_zero is not None and arm is not None and self.T_base_sensor is not None:
             self._compare_depth(self._touch_zero, arm.t_ns, self.T_base_sensor)
 
-    def _compare_depth(self, zero: TouchZero, t_ns: int, T_base_sensor: Array) -> None:
+    def _compare_depth(self, zero: DepthZero, t_ns: int, T_base_sensor: Array) -> None:
         zero.moved(t_ns, T_base_sensor)
         contact = self.contact
         if contact is None or contact.change is None or self._depth_run is None:
@@ -446,9 +452,14 @@ class ContactServo:
         """Measure the travelled distance from the current pose, from which the sensor approaches."""
         self.reset_travel()
         self._letting_go, self._lets_go = None, False
-        self._touch_zero = None if self._depth_run is None else TouchZero()
+        self._touch_zero = self._new_touch_zero()
         if self.sidestepping_run is not None and self.T_base_sensor is not None:
             self.sidestepping_run.begin_approach(self.T_base_sensor)
+
+    def _new_touch_zero(self) -> DepthZero | None:
+        if self._depth_run is None:
+            return None
+        return RestingDepth() if self._depth_run.surface_rests else TouchZero()
 
     def reset_travel(self) -> None:
         """Measure the travelled distance from the current pose."""
@@ -585,7 +596,7 @@ class ContactServo:
     def servo_step(self, V_ff: Array, *, running: bool = True) -> Array | None:
         """Return the twist (6,) of the tool that holds the contact; None while there is no valid estimate."""
         T_s_f = self.T_s_f
-        if T_s_f is not None and self._easing_run is not None and (ease_m := self._easing_run.ease_m) > 0.0:
+        if T_s_f is not None and self._easing_run is not None and (ease_m := self._easing_run.ease_m) != 0.0:
             # To the controller it is pressed in by as much more.
             T_s_f = se3.compose(T_s_f, se3.exp([0.0, 0.0, -ease_m, 0.0, 0.0, 0.0]))
         V_tcp = self.controller.step(T_s_f, 0 if self.contact is None else self.contact.t_ns, V_ff)

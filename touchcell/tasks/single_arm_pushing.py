@@ -185,6 +185,8 @@ class SingleArmPushingConfig(PushConfig, ServoConfig):
 class Push:
     """Behavior of pushing: along the contact normal, steered to the target, until it is reached."""
 
+    surface_rests: Final = False
+
     def __init__(self, config: PushConfig, bounds: PushBounds, standing: Standing, *, followed: bool = False) -> None:
         self._speed_m_s = 1e-3 * config.push_speed_mm_s
         self._timeout_s = config.push_timeout_s

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from typing import Annotated
+from typing import Annotated, Final
 
 import numpy as np
 from pydantic import PositiveFloat
@@ -24,6 +24,7 @@ from touchcell.tasks.surface_path import Guide, PathConfig
 
 _APPROACH_M = 0.02
 """The first contact is hardly farther from the start than this."""
+_ERROR_SD_M: Final = 0.06e-3
 _BEND = 0.5
 """Share of a way by which its end may be elsewhere: on a plane tilted by 30 deg."""
 
@@ -53,10 +54,33 @@ class SurfaceFollowingConfig(ServoConfig):
     return_lift_mm: PositiveFloat | None = 3.0
 
 
+class ReadDepth:
+    """What a model reads of a depth, by the arm's own motion as the sensor was pressed in.
+
+    An error that the arm's motion says is itself uncertain by 0.06 mm: a model that is right is left alone.
+    """
+
+    def __init__(self) -> None:
+        self._beyond_m = 0.0
+
+    def correct_depth(self, error_m: float) -> None:
+        """Take note that the model reads ``error_m`` too much."""
+        self._beyond_m = error_m**3 / (error_m**2 + _ERROR_SD_M**2)
+
+    @property
+    def ease_m(self) -> float:
+        """Depth by which less is to be read than is to be held."""
+        return -self._beyond_m
+
+
 class Follow:
     """Behavior of surface following: a tangential feedforward until the distance is covered."""
 
+    surface_rests: Final = True
+
     def __init__(self, config: SurfaceFollowingConfig) -> None:
+        self._depth = ReadDepth()
+        self.correct_depth = self._depth.correct_depth
         angle = np.radians(config.direction_deg)
         self._direction = np.array([np.cos(angle), np.sin(angle), 0.0])
         self._way = _curved_way(config)
@@ -82,6 +106,11 @@ class Follow:
         self._left_m -= float(self._direction @ now[:3, :3].T @ (now[:3, 3] - before[:3, 3]))
         return self._left_m <= 0.0
 
+    @property
+    def ease_m(self) -> float:
+        """Depth by which less is to be read than is to be held."""
+        return self._depth.ease_m
+
     def shortfall(self) -> str:
         """Return nothing: it finishes where its distance is covered."""
         return ""
@@ -94,7 +123,11 @@ class Follow:
 class FollowPath:
     """Behavior of surface following along a planned path."""
 
+    surface_rests: Final = True
+
     def __init__(self, config: SurfaceFollowingConfig, path: PathConfig) -> None:
+        self._depth = ReadDepth()
+        self.correct_depth = self._depth.correct_depth
         self._guide = Guide(path.points(), 1e-3 * config.lookahead_mm)
         self._way = _curved_way(config)
         # A path over a surface is longer than in its plane, and slower where it bends.
@@ -114,6 +147,11 @@ class FollowPath:
         """Head for the next point of the path; return True at its end."""
         self._way.update(self._guide.direction(now), now, T_s_f)
         return self._guide.along_m >= self._guide.length_m
+
+    @property
+    def ease_m(self) -> float:
+        """Depth by which less is to be read than is to be held."""
+        return self._depth.ease_m
 
     def shortfall(self) -> str:
         """Return nothing: it finishes at the end of its path."""

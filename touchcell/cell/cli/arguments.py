@@ -87,6 +87,17 @@ def speed(text: str) -> float:
     return number
 
 
+def depth(text: str) -> float:
+    """A depth above 0, at most 10 mm: half of a tip's radius, beyond which its simulated skin is none."""
+    try:
+        number = float(text)
+    except ValueError:
+        number = 0.0
+    if not 0.0 < number <= 10.0:
+        raise argparse.ArgumentTypeError(f"must be above 0 and at most 10, not {text!r}")
+    return number
+
+
 def positive_or(text: str, message: str) -> int:
     """A whole number of 1 or more; otherwise an error with ``message``."""
     try:

@@ -8,7 +8,7 @@ from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
 
-from touchcell.cell.cli.arguments import Subparsers, add_command, positive, whole
+from touchcell.cell.cli.arguments import Subparsers, add_command, depth, positive, whole
 from touchcell.cell.cli.exit_codes import EXIT_OK, EXIT_TASK_FAILED
 from touchcell.cell.cli.sim_recipes import PRESETS, SimRecipe
 from touchcell.cell.cli.workers import add_workers, workers_of
@@ -96,6 +96,12 @@ def _add_training(commands: Subparsers) -> None:
     train_sim.add_argument(
         "--feels", choices=("plane", "shape"), help="surfaces to press on: planes, or such as bend (default: plane)"
     )
+    train_sim.add_argument(
+        "--tips",
+        choices=("one", "spread"),
+        help="sensors: about one tip, or on surfaces as sensors of a kind differ (default: one)",
+    )
+    train_sim.add_argument("--deepest-mm", type=depth, metavar="MM", help="largest depth (default: 6.5)")
     train_sim.add_argument("--epochs", type=positive, help="passes over the images (default: the kind's own)")
     _add_seed(train_sim)
 

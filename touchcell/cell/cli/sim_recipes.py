@@ -11,6 +11,9 @@ if TYPE_CHECKING:
 Feels: TypeAlias = Literal["plane", "shape"]
 """What surfaces are made of."""
 
+Tips: TypeAlias = Literal["one", "spread"]
+"""How far the sensors are apart."""
+
 
 @dataclass(frozen=True, slots=True)
 class SimRecipe:
@@ -25,6 +28,9 @@ class SimRecipe:
         seed: of everything random.
         feature: ``edge`` for contacts with edges, of the default tip; ``kinds`` for a classifier of what is touched.
         feels: ``shape`` for surfaces that bend, of the default tip.
+        tips: ``one`` for sensors that scatter a little about one; ``spread`` for such as differ (``tip_spread``), on
+            surfaces.
+        deepest_mm: largest depth.
     """
 
     samples: int = 12_000
@@ -35,11 +41,15 @@ class SimRecipe:
     seed: int = 0
     feature: Feature | Literal["kinds"] = "surface"
     feels: Feels = "plane"
+    tips: Tips = "one"
+    deepest_mm: float = 6.5
 
 
 PRESETS: Final = {
     "sim_edge": SimRecipe(samples=192_000, kind="markers", epochs=10, feature="edge"),
     "sim_kinds": SimRecipe(samples=20_000, epochs=20, feature="kinds"),
     "sim_shape": SimRecipe(samples=40_000, kind="markers", epochs=20, feels="shape"),
+    # Objects that need force press in by 7 mm before an interlock stops the arm.
+    "sim_tips": SimRecipe(samples=60_000, kind="markers", epochs=16, feels="shape", tips="spread", deepest_mm=8.0),
 }
 """How the models of these names were made."""

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from touchcell.cell.cli.sim_recipes import Feels, SimRecipe
+from touchcell.cell.cli.sim_recipes import Feels, SimRecipe, Tips
 from touchcell.drivers.replay.dataset import FRAME_SIZE, PUBLIC_CROP
 from touchcell.geometry import se3
 from touchcell.geometry.types import ImageArray
@@ -35,6 +35,7 @@ from touchcell.simulation.samples import USUAL_VARIATION, SampledContact, Variat
 from touchcell.simulation.shape_samples import shape_contacts
 from touchcell.simulation.tip import Tip, TipParameters
 from touchcell.simulation.tip_file import TipFile, load_tip
+from touchcell.simulation.tip_spread import TipSpread
 
 if TYPE_CHECKING:
     from touchcell.perception.networks.marker_training import LabelledDiscs
@@ -55,9 +56,6 @@ ARCHITECTURE = Architecture(
     mean_dropout=(0.05,) * 6,
     precision_dropout=(0.05,) * 6,
 )
-
-# From the first touch to beyond the depth at which objects are tracked, so that neither is outside the training range.
-DEPTH_MM = (0.0, 6.5)
 
 FITTED_VARIATION = Variation(
     parameters=0.002,
@@ -82,6 +80,8 @@ DETAIL_SETTINGS: Final[dict[str, Any]] = {
 }
 """Edges and tilts are told by tenths of a pixel (docs/decisions/0051-edges-in-detail.md)."""
 
+_SPREAD_PARAMETERS: Final = 0.02
+"""Relative standard deviation of a tip's parameters about one that is drawn between those that are known."""
 _STEEP: Final = 0.25
 """Of the contacts with edges, on parts of what is rare among random ones."""
 _STEEP_SEED: Final = 500_000
@@ -102,12 +102,16 @@ class Imagined:
         processed: images as the public data have them, cropped and black and white, rather than raw frames.
         feature: what the contacts are with.
         feels: ``plane`` presses on planes, as the paper does; ``shape`` on surfaces that bend. Edges are always shapes.
+        tips: ``one`` scatters a little about that sensor; ``spread`` is of sensors as they differ, on surfaces.
+        deepest_mm: largest depth, beyond that at which objects are tracked; the smallest is the first touch.
     """
 
     sensor: TipFile | None = None
     processed: bool = False
     feature: Feature = "surface"
     feels: Feels = "plane"
+    tips: Tips = "one"
+    deepest_mm: float = 6.5
 
     @property
     def tip(self) -> TipParameters:
@@ -134,13 +138,16 @@ class Imagined:
             steep = round(_STEEP * samples)
             usual = edge_contacts(samples - steep, seed, variation=USUAL_VARIATION)
             return chain(usual, edge_contacts(steep, seed + _STEEP_SEED, variation=USUAL_VARIATION, part=steep_part))
+        depth_mm, variation, tips = (0.0, self.deepest_mm), USUAL_VARIATION, None
+        if self.tips == "spread":
+            variation, tips = replace(variation, parameters=_SPREAD_PARAMETERS), TipSpread().draw
         if self.feels == "shape":
-            return shape_contacts(samples, seed, depth_mm=DEPTH_MM, variation=USUAL_VARIATION)
+            return shape_contacts(samples, seed, depth_mm=depth_mm, variation=variation, tips=tips)
         if self.sensor is None:
-            return contacts(samples, seed, depth_mm=DEPTH_MM, variation=USUAL_VARIATION)
+            return contacts(samples, seed, depth_mm=depth_mm, variation=variation, tips=tips)
         sensor = self.sensor
         return contacts(
-            samples, seed, depth_mm=DEPTH_MM, parameters=sensor.tip, rig=sensor.rig, variation=FITTED_VARIATION
+            samples, seed, depth_mm=depth_mm, parameters=sensor.tip, rig=sensor.rig, variation=FITTED_VARIATION
         )
 
 
@@ -155,7 +162,7 @@ def train_on_simulation(out: Path, recipe: SimRecipe) -> None:
     """
     assert recipe.feature != "kinds"
     tip = None if recipe.tip is None else load_tip(recipe.tip)
-    imagined = Imagined(tip, recipe.processed, recipe.feature, recipe.feels)
+    imagined = Imagined(tip, recipe.processed, recipe.feature, recipe.feels, recipe.tips, recipe.deepest_mm)
     seed, epochs = recipe.seed, recipe.epochs
     with Display() as display:
         if recipe.kind == "markers":
