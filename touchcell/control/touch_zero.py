@@ -20,14 +20,19 @@ from touchcell.geometry.types import Array
 _FIRST_CHANGE: Final = 0.012
 """Change from which a frame counts: less is noise ..."""
 LAST_CHANGE: Final = 0.2
-"""... and to which: the change of deeper contacts is no straight line."""
+"""... and to which: the change of deeper contacts is no straight line ..."""
+_LAST_AT_REST: Final = 0.3
+"""... by much, up to 2 mm or so."""
 _UNSEEN_M: Final = 0.07e-3
 """Depth at which the straight line of change over depth is zero: the first patches are too small to be seen, on the
 simulated tips that are fitted to a real sensor 0.06 to 0.10 mm."""
 _FEWEST: Final = 3
 _STRAIGHT: Final = 0.6
 """Share of the steepest growth of the change from which the object still rests."""
-_AT_REST_M_S: Final = 0.5e-3
+_AT_REST_M: Final = 0.1e-3
+"""Way within the last poses from which the sensor does not rest: of one that sways, the ends may be at one place."""
+_UNSHEARED_M: Final = 0.1e-3
+"""Distance from the line of the approach up to which the contact is not sheared."""
 _NOW: Final = 4
 """Last poses that tell whether the sensor still moves ..."""
 _EVEN: Final = 0.8
@@ -36,6 +41,8 @@ _ALONG: Final = 0.9
 """Share of a motion that is along the sensor's axis if it is an approach."""
 _MOST_TURN: Final = 0.9998
 """Cosine of the turn (1.1 deg) up to which the sensor's motion is a straight one."""
+_MOST_TURN_AT_REST: Final = 0.99
+"""The same (8 deg) of one that has made contact, and turns to face it: that leaves a round tip as deep as it is."""
 _HISTORY_NS: Final = 200_000_000
 _WINDOW: Final = 3
 """Frames over which the depth is to grow with the arm's advance while the object rests ..."""
@@ -81,6 +88,8 @@ class TouchZero:
         self._poses: deque[tuple[int, Array]] = deque()
         self._moving: list[tuple[float, float]] = []
         self._seq = -1
+        self._approached = False
+        self._approaching: Array | None = None
         self._touched_error_m = 0.0
         self._pressed: list[tuple[float, float]] = []
         self.ended = False
@@ -104,21 +113,24 @@ class TouchZero:
         if seq == self._seq or self.ended or self._start is None or len(self._poses) < 2:
             return
         self._seq = seq
-        newest = self._poses[-1][1]
-        if float(self._start[:3, 2] @ newest[:3, 2]) < _MOST_TURN:
+        straight = float(self._start[:3, 2] @ self._poses[-1][1][:3, 2])
+        if straight < (_MOST_TURN_AT_REST if self.error_m is None and self._moving else _MOST_TURN):
             self.ended = self.ended or bool(self._pressed)
-            return
-        if self.error_m is not None:
+        elif self.error_m is not None:
             self._press(self._advance_m(t_frame_ns), T_s_f)
-        elif _FIRST_CHANGE < change < LAST_CHANGE:
-            advance_m, speed_m_s, now_m_s = self._advance_m(t_frame_ns), self._speed_m_s(0), self._speed_m_s(-_NOW)
-            if speed_m_s > _AT_REST_M_S:
-                # Not while it slows down: frames that are late would then show less than there is. Nor while it is
-                # shifted aside: shear changes the image as much as depth does.
-                if now_m_s > _EVEN * speed_m_s and self._advances(now_m_s):
-                    self._moving.append((advance_m, change))
-            elif T_s_f is not None and len(self._moving) >= _FEWEST:
-                self._conclude(advance_m, change, T_s_f)
+        elif self._moves():
+            speed_m_s, now_m_s = self._speed_m_s(0), self._speed_m_s(-_NOW)
+            # Not while it slows down: frames that are late would then show less than there is. Nor while it is
+            # shifted aside: shear changes the image as much as depth does.
+            if self._approached or not _FIRST_CHANGE < change < LAST_CHANGE:
+                return
+            if now_m_s > _EVEN * speed_m_s and self._advances(now_m_s):
+                self._moving.append((self._advance_m(t_frame_ns), change))
+                self._approaching = self._poses[-1][1]
+            else:
+                self._approached = len(self._moving) >= _FEWEST
+        elif T_s_f is not None and _FIRST_CHANGE < change < _LAST_AT_REST and self._has_approached():
+            self._conclude(self._advance_m(t_frame_ns), change, T_s_f)
 
     def _press(self, advance_m: float, T_s_f: Array | None) -> None:
         """Follow the error while the arm presses on, until the object gives way."""
@@ -153,6 +165,18 @@ class TouchZero:
         """Return the mean speed since one of the poses that were noted."""
         (then_ns, then), (now_ns, now) = self._poses[max(since, -len(self._poses))], self._poses[-1]
         return float(np.linalg.norm(now[:3, 3] - then[:3, 3])) / max(1e-9 * (now_ns - then_ns), 1e-9)
+
+    def _moves(self) -> bool:
+        """Return True if the sensor has moved within the last poses."""
+        points = np.array([T[:3, 3] for _, T in self._poses])
+        return float(np.linalg.norm(points - points[-1], axis=1).max()) > _AT_REST_M
+
+    def _has_approached(self) -> bool:
+        """Return True if the approach is known, and the sensor is on its line."""
+        if self._approaching is None or len(self._moving) < _FEWEST:
+            return False
+        way, axis = self._poses[-1][1][:3, 3] - self._approaching[:3, 3], self._approaching[:3, 2]
+        return float(np.linalg.norm(way - (way @ axis) * axis)) < _UNSHEARED_M
 
     def _advances(self, speed_m_s: float) -> bool:
         """Return True if the sensor now moves along its axis, at that speed."""

@@ -75,6 +75,8 @@ _SIDE_SIGMA_RAD: Final = math.radians(2.5)
 _MOST_SEARCHES: Final = 2
 _ERROR_SHARE: Final = 0.15
 """Share of a cycle's reading in the mean error of the heading."""
+_SIDE_SHARE: Final = 0.5
+"""Share of a side's direction as touches tell it in the heading of a push: it is as far wrong as what a model reads."""
 _FROM_EDGE_M: Final = 0.012
 """Distance of touches of a side from its edges ..."""
 _FARTHEST_APART_M: Final = 0.025
@@ -314,11 +316,11 @@ class PredictivePush:
             self._steps = (
                 self._feel_edge(T_base_sensor, self._contact)
                 if self._has_edge
-                else self._step_to(T_base_sensor, model.middle_m or 0.0)
+                else self._step_to(T_base_sensor, model.middle_m or 0.0, _NEAR_M)
             )
         else:
             self._sidesteps += 1
-            self._steps = self._step_to(T_base_sensor, self._estimator.model.offset_m)
+            self._steps = self._step_to(T_base_sensor, self._estimator.model.offset_m, _CLEAR_M)
 
     def next_goal(self, T_base_sensor: Array, T_s_f: Array | None) -> Goal | None:
         """Return where the sensor shall go next beside the object; None where it shall touch again.
@@ -330,16 +332,16 @@ class PredictivePush:
         self._felt = None if T_s_f is None else self.touched(T_base_sensor, T_s_f)
         return next(self._steps, None)
 
-    def _step_to(self, T_base_sensor: Array, left_m: float) -> Iterator[Goal]:
-        """Let go and touch again, farther to the left."""
+    def _step_to(self, T_base_sensor: Array, left_m: float, clear_m: float) -> Iterator[Goal]:
+        """Let go and touch again, farther to the left and straight on."""
         assert self._contact is not None
         assert self._middle is not None
         contact, heading = self._contact, self._contact.heading_rad
         self._resting = self._middle, self._estimator.middle_sigma_m
         self.located = self._middle
-        yield Goal(placed(T_base_sensor, _tip_behind(T_base_sensor, heading, _CLEAR_M)), passes=True)
+        yield Goal(placed(T_base_sensor, _tip_behind(T_base_sensor, heading, clear_m)), passes=True)
         at = Pose(contact.x_m, contact.y_m, heading).ahead(left_m, 0.5 * math.pi)
-        yield Goal(placed(T_base_sensor, at.ahead(-self._settings.tip_radius_m - _CLEAR_M)))
+        yield Goal(placed(T_base_sensor, at.ahead(-self._settings.tip_radius_m - clear_m)))
 
     def _feel_edge(self, T_base_sensor: Array, side: Contact) -> Iterator[Goal]:
         """Search for the edges of the side, and then be opposite its middle."""
@@ -565,7 +567,7 @@ class PredictivePush:
         model = estimator.model
         # What it had turned by while the error of its normal showed was taken for a part of that.
         turned = model.offset_m * self._loading_m / (model.reach_m**2 + model.lever_m2)
-        contact = Pose(behind.x, behind.y, heading + turned).ahead(ahead_m)
+        contact = Pose(behind.x, behind.y, heading + _SIDE_SHARE * turned).ahead(ahead_m)
         ahead = contact.ahead(model.reach_m)
         self._middle = ahead.ahead(model.middle_m or 0.0, 0.5 * math.pi)
         return ahead.ahead(model.offset_m, 0.5 * math.pi), self._middle
@@ -574,7 +576,7 @@ class PredictivePush:
         """Return a heading without the error that shows while the object rests: its side lies between its edges.
 
         Models misread normals otherwise under load than at a touch, so the error counts as it is when the object
-        has begun to slide.
+        has begun to slide; half of it, since touches tell how the side lies no better than the model reads it.
         """
         if self._resting is not None and self._side_is_felt:
             self._side_heading, self._heading_error, self._loaded_m = self._resting[0].heading, 0.0, 0.0
@@ -584,7 +586,7 @@ class PredictivePush:
         error = math.remainder(heading - self._side_heading, 2.0 * math.pi)
         begins_m, ends_m = _LOADING_M
         if abs(error) > _SIDE_SIGMA_RAD:
-            return heading - self._heading_error
+            return heading - _SIDE_SHARE * self._heading_error
         if not self._moves:
             if depth_m >= self._loaded_m:
                 self._heading_error += _ERROR_SHARE * (error - self._heading_error)
@@ -593,7 +595,7 @@ class PredictivePush:
         if begins_m < self._moved_m < ends_m:
             self._loading.append((self._moved_m, error))
             self._loading_m, self._heading_error = (fmean(each) for each in zip(*self._loading, strict=True))
-        return heading - self._heading_error
+        return heading - _SIDE_SHARE * self._heading_error
 
     def _touch_again(self, contact: Pose, middle: Pose, sigma_m: float) -> None:
         """Know where the middle is beside a new contact, of an object that has rested meanwhile."""
