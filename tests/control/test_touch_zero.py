@@ -12,7 +12,6 @@ from touchcell.geometry.types import Array
 
 FRAME_NS = 33_000_000
 STEP_NS = 11_000_000
-UNSEEN_M = 0.07e-3
 
 
 def contact(depth_m: float) -> Array:
@@ -42,7 +41,7 @@ def approach(zero: TouchZero, at_m: float, read: float, misread_m: float, late_n
         depth_m = min(max(exposed_m - at_m, 0.0), gives_way_m)
         touched = contact(read * depth_m + misread_m) if depth_m > 0.3e-3 else None
         # Stamped as if it had come without delay.
-        zero.saw(t_ns, seq, max(0.004, 90.0 * (depth_m - UNSEEN_M)), touched)
+        zero.saw(t_ns, seq, 0.004 if depth_m == 0.0 else 90.0 * depth_m, touched)
 
 
 @given(st.floats(3e-3, 8e-3), st.floats(0.92, 1.05), st.floats(-0.5e-3, 0.5e-3), st.sampled_from([0, 9, 18, 27]))
@@ -102,7 +101,7 @@ def test_what_shear_changes_of_the_image_counts_for_no_depth() -> None:
             T[0, 3], T[2, 3] = aside_m, advance_m
             zero.moved((3 * seq + step) * STEP_NS, T)
         depth_m = max(advance_m - 5.4e-3, 0.0)
-        change = max(0.0, 100.0 * (depth_m - UNSEEN_M)) + (60.0 * aside_m if depth_m else 0.0)
+        change = 100.0 * depth_m + (60.0 * aside_m if depth_m else 0.0)
         zero.saw((3 * seq + 2) * STEP_NS, seq, change, contact(depth_m + read_m) if depth_m > 0.4e-3 else None)
     assert zero.error_m == pytest.approx(read_m, abs=0.05e-3)
 
@@ -120,7 +119,7 @@ def test_depth_is_not_taken_while_the_sensor_is_shifted_aside_or_sways() -> None
             zero.moved(t_ns, T)
         seq += 1
         depth_m = max(advance_m - 5e-3, 0.0)
-        change = max(0.004, 90.0 * (depth_m - UNSEEN_M) * (1.0 + 1.5e3 * aside_m))
+        change = 0.004 + 90.0 * depth_m * (1.0 + 1.5e3 * aside_m)
         zero.saw(t_ns, seq, change, None if read_m is None else contact(read_m))
 
     for k in range(20):
@@ -147,5 +146,5 @@ def test_depth_is_taken_while_the_sensor_turns_to_face_what_it_touches() -> None
         for step in range(3):
             zero.moved(seq * FRAME_NS + step * STEP_NS, T)
         depth_m = max(T[2, 3] - 5e-3, 0.0)
-        zero.saw(seq * FRAME_NS + 2 * STEP_NS, seq, max(0.004, 90.0 * (depth_m - UNSEEN_M)), contact(0.9e-3) if depth_m > 0 else None)
+        zero.saw(seq * FRAME_NS + 2 * STEP_NS, seq, 0.004 + 90.0 * depth_m, contact(0.9e-3) if depth_m > 0 else None)
     assert zero.error_m == pytest.approx(-0.3e-3, abs=0.07e-3)

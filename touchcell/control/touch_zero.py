@@ -23,9 +23,6 @@ LAST_CHANGE: Final = 0.2
 """... and to which: the change of deeper contacts is no straight line ..."""
 _LAST_AT_REST: Final = 0.3
 """... by much, up to 2 mm or so."""
-_UNSEEN_M: Final = 0.07e-3
-"""Depth at which the straight line of change over depth is zero: the first patches are too small to be seen, on the
-simulated tips that are fitted to a real sensor 0.06 to 0.10 mm."""
 _FEWEST: Final = 3
 _STRAIGHT: Final = 0.6
 """Share of the steepest growth of the change from which the object still rests."""
@@ -200,7 +197,7 @@ class TouchZero:
         if slope <= 0.0:
             return
         # The arm advances along the sensor's axis, and depth is along the normal.
-        depth_m = (change / slope + _UNSEEN_M) * float(T_s_f[2, 2])
+        depth_m = change / slope * float(T_s_f[2, 2])
         error_m = depth_of(T_s_f) - depth_m
         if abs(error_m) < LARGEST_M:
             self.error_m = self._touched_error_m = error_m

@@ -24,7 +24,7 @@ from touchcell.tasks.surface_path import Guide, PathConfig
 
 _APPROACH_M = 0.02
 """The first contact is hardly farther from the start than this."""
-_ERROR_SD_M: Final = 0.06e-3
+_ERROR_SD_M: Final = 0.1e-3
 _BEND = 0.5
 """Share of a way by which its end may be elsewhere: on a plane tilted by 30 deg."""
 
@@ -57,7 +57,7 @@ class SurfaceFollowingConfig(ServoConfig):
 class ReadDepth:
     """What a model reads of a depth, by the arm's own motion as the sensor was pressed in.
 
-    An error that the arm's motion says is itself uncertain by 0.06 mm: a model that is right is left alone.
+    An error that the arm's motion says is itself uncertain by 0.1 mm: a model that is right is left alone.
     """
 
     def __init__(self) -> None:
