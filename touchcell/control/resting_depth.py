@@ -77,8 +77,10 @@ class RestingDepth:
                 self._follow(self._way, self._pose_at(t_frame_ns), T_s_f)
             return
         self._zero.saw(t_frame_ns, seq, change, T_s_f)
-        self.error_m = self._zero.error_m
-        if self.error_m is not None and T_s_f is not None:
+        if self._zero.error_m is not None and T_s_f is not None:
+            # The change at rest is right however late frames are, but not quite proportional to depth; how far the arm
+            # has advanced is right if frames are stamped as they should be. Each may be off by 0.1 mm.
+            self.error_m = 0.5 * (self._zero.error_m + self._zero.advance_error_m)
             touched_m = self._pose_at(t_frame_ns)[:3, 3]
             self._way = _Way(touched_m, touched_m, depth_of(T_s_f), self.error_m)
 

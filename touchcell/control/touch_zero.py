@@ -95,6 +95,8 @@ class TouchZero:
         """Depth that the model reads beyond what the arm's motion says; None while it is not known."""
         self.change_per_m: float | None = None
         """Change of the image per depth, while that is small; None while it is not known."""
+        self.advance_error_m = 0.0
+        """The error at the touch, once it is known, by how far the arm has advanced beyond where the change began."""
 
     def moved(self, t_ns: int, T_base_sensor: Array) -> None:
         """Take note of the sensor's pose (4, 4)."""
@@ -202,6 +204,8 @@ class TouchZero:
         if abs(error_m) < LARGEST_M:
             self.error_m = self._touched_error_m = error_m
             self.change_per_m = change / depth_m
+            began_m = float(advances.mean() - changes.mean() / slope)
+            self.advance_error_m = depth_of(T_s_f) - (advance_m - began_m) * float(T_s_f[2, 2])
             self._pressed.append((advance_m * float(T_s_f[2, 2]), depth_of(T_s_f)))
 
 

@@ -134,8 +134,11 @@ class DepthAware(Protocol):
         """True if what it touches cannot give way before it runs."""
         ...
 
-    def correct_depth(self, error_m: float) -> None:
-        """Take note that a model reads a depth which is larger by ``error_m`` than the arm's own motion says."""
+    def correct_depth(self, error_m: float, sigma_m: float) -> None:
+        """Take note that a model reads a depth which is larger by ``error_m`` than the arm's own motion says.
+
+        ``sigma_m`` is the standard deviation that the model claims for it.
+        """
         ...
 
 
@@ -421,10 +424,15 @@ class ContactServo:
         valid = contact.in_contact and contact.in_range and contact.measured is not None
         zero.saw(contact.t_frame_ns, contact.seq, contact.change, self.T_s_f_measured if valid else None)
         if zero.error_m is not None:
-            self._depth_run.correct_depth(zero.error_m)
+            self._depth_run.correct_depth(zero.error_m, self._depth_sigma_m(contact))
             self._change_per_m = zero.change_per_m
         if zero.ended:
             self._touch_zero = None
+
+    @staticmethod
+    def _depth_sigma_m(contact: ContactEstimate) -> float:
+        single = contact.belief if contact.measured is None else contact.measured
+        return 0.0 if single is None else math.sqrt(float(single.covariance[2, 2]))
 
     def aim_back(self, lift_m: float) -> None:
         """Aim at the pose in which the contact was last felt, withdrawn along the sensor's axis by ``lift_m``."""

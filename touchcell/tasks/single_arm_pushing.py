@@ -264,7 +264,7 @@ class Push:
         if self._predictive is not None:
             self._predictive.begin_sidestep(T_base_sensor)
 
-    def correct_depth(self, error_m: float) -> None:
+    def correct_depth(self, error_m: float, sigma_m: float) -> None:
         """Take note of how much deeper than it is a model reads the contact."""
         if self._predictive is not None:
             self._predictive.depth_error_m = error_m

@@ -24,7 +24,7 @@ from touchcell.tasks.surface_path import Guide, PathConfig
 
 _APPROACH_M = 0.02
 """The first contact is hardly farther from the start than this."""
-_ERROR_SD_M: Final = 0.1e-3
+_ARM_SIGMA_M: Final = 0.1e-3
 _BEND = 0.5
 """Share of a way by which its end may be elsewhere: on a plane tilted by 30 deg."""
 
@@ -57,15 +57,18 @@ class SurfaceFollowingConfig(ServoConfig):
 class ReadDepth:
     """What a model reads of a depth, by the arm's own motion as the sensor was pressed in.
 
-    An error that the arm's motion says is itself uncertain by 0.1 mm: a model that is right is left alone.
+    The arm's motion tells an error to 0.1 mm. A model that claims to know better is left alone, unless the error is
+    larger than both claims explain (empirical Bayes: the variance of its error is at least what shows).
     """
 
     def __init__(self) -> None:
         self._beyond_m = 0.0
 
-    def correct_depth(self, error_m: float) -> None:
-        """Take note that the model reads ``error_m`` too much."""
-        self._beyond_m = error_m**3 / (error_m**2 + _ERROR_SD_M**2)
+    def correct_depth(self, error_m: float, sigma_m: float) -> None:
+        """Take note that the model reads ``error_m`` too much, and claims a standard deviation of ``sigma_m``."""
+        arm = _ARM_SIGMA_M**2
+        model = max(sigma_m**2, error_m**2 - sigma_m**2 - arm)
+        self._beyond_m = error_m * model / (model + arm)
 
     @property
     def ease_m(self) -> float:
