@@ -17,7 +17,7 @@ from touchcell.geometry import se3
 from touchcell.tasks.interface import Task
 from touchcell.tasks.servoing import servo_table
 from touchcell.tasks.state_machine import state_name
-from touchcell.tasks.surface_following import SPEC, Follow, SurfaceFollowingConfig
+from touchcell.tasks.surface_following import SPEC, Follow, ReadDepth, SurfaceFollowingConfig
 
 QUICK = SurfaceFollowingConfig(distance_mm=20.0, approach_distance_mm=20.0, retract_mm=5.0, settle_time_s=0.1)
 ACTIVE = ("prepare", "approach", "check", "settle", "run", "return", "retract")
@@ -471,3 +471,26 @@ def test_an_operators_stop_withdraws_from_the_dome_and_comes_to_rest():
     loop.clock.advance_s(1.0)
     loop.scene.contact("sensor")
     np.testing.assert_array_equal(loop.arm.T_world_tcp(), before)
+
+
+def test_a_model_that_knows_its_depth_is_left_alone_and_one_that_does_not_is_corrected() -> None:
+    """The arm's motion tells an error to 0.1 mm."""
+
+    def eased_mm(error_mm: float, sigma_mm: float) -> float:
+        depth = ReadDepth()
+        depth.correct_depth(1e-3 * error_mm, 1e-3 * sigma_mm)
+        return 1e3 * depth.ease_m
+
+    assert eased_mm(-0.1, 0.03) == pytest.approx(0.0, abs=0.02)
+    assert eased_mm(-0.2, 0.3) == pytest.approx(0.18, abs=0.01)
+    # However sure it is.
+    assert eased_mm(-0.5, 0.03) == pytest.approx(0.48, abs=0.01)
+    assert eased_mm(0.5, 0.03) == pytest.approx(-0.48, abs=0.01)
+
+
+@given(st.floats(-1.5, 1.5), st.floats(0.0, 2.0))
+def test_a_correction_is_never_larger_than_what_the_arm_says(error_mm: float, sigma_mm: float) -> None:
+    depth = ReadDepth()
+    depth.correct_depth(1e-3 * error_mm, 1e-3 * sigma_mm)
+    assert abs(depth.ease_m) <= abs(1e-3 * error_mm)
+    assert depth.ease_m * error_mm <= 0.0

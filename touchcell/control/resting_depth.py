@@ -1,9 +1,9 @@
 """How much a model misreads the depth on a surface that does not give way, from the arm's own motion.
 
-The first touch tells the depth without a model (``touch_zero``). From there on depth grows by the sensor's way along the
-normal, which the arm knows, also while the sensor turns to face the surface and begins to slide. What the model reads
-beyond that is its error: another one at rest than where the skin is dragged, so that the last one is of a sensor that
-slides. Over a few millimetres the errors of its normals add up to little.
+The first touch tells the depth without a model (``touch_zero``). From there on depth grows by the sensor's way along
+the normal, which the arm knows, also while the sensor turns to face the surface and begins to slide. What the model
+reads beyond that is its error: another one at rest than where the skin is dragged, so that the last one is of a sensor
+that slides. Over a few millimetres the errors of its normals add up to little.
 """
 
 from __future__ import annotations

@@ -10,8 +10,8 @@ import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat
 
 from touchcell.control.pid import PidGains
-from touchcell.control.servo import TactileServo
 from touchcell.control.resting_depth import RestingDepth
+from touchcell.control.servo import TactileServo
 from touchcell.control.touch_zero import LAST_CHANGE, DepthZero, TouchZero
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array

@@ -9,6 +9,8 @@ REAL_TIP: Final = "franka_tactip_1"
 """Tip that was fitted to the images of a real sensor."""
 REAL_TIP_MODEL: Final = "sim_franka_tactip_1"
 """Shipped model that was adapted to it (docs/decisions/0070-adapted-to-a-tip.md)."""
+SPREAD_MODEL: Final = "sim_tips"
+"""Shipped model of a spread of tips, that one among them (docs/decisions/0103-trained-over-tips.md)."""
 SAMPLED: Final = "truth sampled"
 """Ends the names of rows in which nothing is quite what the controllers are told."""
 
