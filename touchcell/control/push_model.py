@@ -183,6 +183,10 @@ class PushEstimator:
         self._covariance[1, :] *= scale
         self._covariance[:, 1] *= scale
 
+    def shift(self, left_m: float) -> None:
+        """Take the object to be farther to the left of its contact by a distance than was known."""
+        self._mean[::2] += left_m
+
     def move_contact(self, middle_m: float, sigma_m: float, *, keep_eccentricity: bool = False) -> None:
         """Begin again with another contact of the same object.
 

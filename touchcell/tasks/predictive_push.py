@@ -75,8 +75,14 @@ _SIDE_SIGMA_RAD: Final = math.radians(2.5)
 _MOST_SEARCHES: Final = 2
 _ERROR_SHARE: Final = 0.15
 """Share of a cycle's reading in the mean error of the heading."""
-_SIDE_SHARE: Final = 0.5
-"""Share of a side's direction as touches tell it in the heading of a push: it is as far wrong as what a model reads."""
+_READ_SIGMA_RAD: Final = math.radians(0.4)
+"""Standard deviation of a normal that a model reads of a loaded contact ..."""
+_FELT_SIGMA_RAD: Final = math.radians(0.25)
+"""... of a side's direction by touches that are far apart ..."""
+_FELT_SIGMA_M: Final = 0.2e-3
+"""... and of where either of two touches is, beyond that."""
+_TURN_RAD: Final = math.radians(0.2)
+"""Turn of a side over which the place of its middle is compared."""
 _FROM_EDGE_M: Final = 0.012
 """Distance of touches of a side from its edges ..."""
 _FARTHEST_APART_M: Final = 0.025
@@ -204,6 +210,9 @@ class PredictivePush:
         self._plan = Plan(0.0, 0.0, math.inf)
         self._side_is_felt = False
         self._side_heading: float | None = None
+        self._side_share = _share_of_side(0.0)
+        # Of the side's middle to the left, as its edges tell it, per turn of the side.
+        self._aside_per_rad = 0.0
         self._heading_error = 0.0
         self._loaded_m = 0.0
         self._loading: list[tuple[float, float]] = []
@@ -421,10 +430,11 @@ class PredictivePush:
         touches: list[Contact] = []
         if apart_m < _LEAST_APART_M:
             return touches
-        for left_m in (left * apart_m, -left * apart_m):
+        # The first one tells the second where the side is.
+        for left_m, slow_m in ((left * apart_m, _UNSURE_M), (-left * apart_m, _SLOW_M)):
             clear = at.ahead(-self._settings.tip_radius_m - _NEAR_M).ahead(left_m, 0.5 * math.pi)
             yield Goal(placed(T_base_sensor, clear), passes=True)
-            yield Goal(placed(T_base_sensor, clear.ahead(2.0 * _NEAR_M)), feels=True, slow_m=_NEAR_M + _UNSURE_M)
+            yield Goal(placed(T_base_sensor, clear.ahead(2.0 * _NEAR_M)), feels=True, slow_m=_NEAR_M + slow_m)
             if self._felt is not None:
                 touches.append(self._felt)
             yield Goal(placed(T_base_sensor, clear), passes=True)
@@ -445,14 +455,15 @@ class PredictivePush:
         misread = math.remainder(right.heading_rad + 0.5 * turned - heading, 2.0 * math.pi)
         if max(abs(misread), abs(math.remainder(heading - middle.heading_rad, 2.0 * math.pi))) > _SAME_SIDE_RAD:
             return None
+        self._side_share = _share_of_side(math.hypot(left.x_m - right.x_m, left.y_m - right.y_m))
         # What is misread of the tilt moves the point at which a round tip seems to touch.
         x, y = 0.5 * (left.x_m + right.x_m), 0.5 * (left.y_m + right.y_m)
         line = Pose(x, y, heading)
-        found_m = [each.edge_on(line) for each in edges]
-        if None in found_m:
+        aside_m, self._aside_per_rad = _middle_on(line, edges), 0.0
+        if aside_m is None:
             aside_m = line.local((middle.x_m, middle.y_m))[1] - self._settings.tip_radius_m * misread
-        else:
-            aside_m = fmean(each for each in found_m if each is not None)
+        elif (turned_m := _middle_on(Pose(x, y, heading + _TURN_RAD), edges)) is not None:
+            self._aside_per_rad = (turned_m - aside_m) / _TURN_RAD
         found = line.ahead(aside_m, 0.5 * math.pi)
         return Contact(found.x, found.y, heading)
 
@@ -567,7 +578,12 @@ class PredictivePush:
         model = estimator.model
         # What it had turned by while the error of its normal showed was taken for a part of that.
         turned = model.offset_m * self._loading_m / (model.reach_m**2 + model.lever_m2)
-        contact = Pose(behind.x, behind.y, heading + _SIDE_SHARE * turned).ahead(ahead_m)
+        if self._moved_m > _LOADING_M[1] and self._loading:
+            # The edges were placed on a side that lay otherwise.
+            correction = (1.0 - self._side_share) * (self._heading_error - turned)
+            estimator.shift(self._aside_per_rad * correction)
+            self._aside_per_rad, model = 0.0, estimator.model
+        contact = Pose(behind.x, behind.y, heading + self._side_share * turned).ahead(ahead_m)
         ahead = contact.ahead(model.reach_m)
         self._middle = ahead.ahead(model.middle_m or 0.0, 0.5 * math.pi)
         return ahead.ahead(model.offset_m, 0.5 * math.pi), self._middle
@@ -576,7 +592,7 @@ class PredictivePush:
         """Return a heading without the error that shows while the object rests: its side lies between its edges.
 
         Models misread normals otherwise under load than at a touch, so the error counts as it is when the object
-        has begun to slide; half of it, since touches tell how the side lies no better than the model reads it.
+        has begun to slide: as large a share of it as touches tell better how the side lies than the model reads it.
         """
         if self._resting is not None and self._side_is_felt:
             self._side_heading, self._heading_error, self._loaded_m = self._resting[0].heading, 0.0, 0.0
@@ -586,7 +602,7 @@ class PredictivePush:
         error = math.remainder(heading - self._side_heading, 2.0 * math.pi)
         begins_m, ends_m = _LOADING_M
         if abs(error) > _SIDE_SIGMA_RAD:
-            return heading - _SIDE_SHARE * self._heading_error
+            return heading - self._side_share * self._heading_error
         if not self._moves:
             if depth_m >= self._loaded_m:
                 self._heading_error += _ERROR_SHARE * (error - self._heading_error)
@@ -595,7 +611,7 @@ class PredictivePush:
         if begins_m < self._moved_m < ends_m:
             self._loading.append((self._moved_m, error))
             self._loading_m, self._heading_error = (fmean(each) for each in zip(*self._loading, strict=True))
-        return heading - _SIDE_SHARE * self._heading_error
+        return heading - self._side_share * self._heading_error
 
     def _touch_again(self, contact: Pose, middle: Pose, sigma_m: float) -> None:
         """Know where the middle is beside a new contact, of an object that has rested meanwhile."""
@@ -656,6 +672,18 @@ class PredictivePush:
             "depth_error_mm": 1e3 * self.depth_error_m,
             "heading_read_error_deg": math.degrees(self._heading_error),
         }
+
+
+def _middle_on(side: Pose, edges: Sequence[EdgeSearch]) -> float | None:
+    """Return where the middle between the edges of a straight side is, to the left of a point of it."""
+    found_m = [left_m for each in edges if (left_m := each.edge_on(side)) is not None]
+    return fmean(found_m) if len(found_m) == len(edges) else None
+
+
+def _share_of_side(apart_m: float) -> float:
+    """Return the share of a side's direction, by touches that are so far apart, in the heading of a push."""
+    read, felt = _READ_SIGMA_RAD**2, _FELT_SIGMA_RAD**2
+    return read / (read + felt + (_FELT_SIGMA_M / max(apart_m, _LEAST_APART_M)) ** 2)
 
 
 def _pose_of(contact: Contact) -> Pose:
