@@ -64,6 +64,18 @@ def test_the_error_while_sliding_is_the_one_that_stays(slope: float) -> None:
     assert following.zero.error_m == pytest.approx(0.1e-3, abs=0.06e-3)
 
 
+def test_a_soft_surface_leaves_the_error_as_it_was_at_the_touch() -> None:
+    following = Following()
+    following.touch(-0.2e-3)
+    for k in range(1, 20):
+        # It gives way by half of what the arm advances.
+        following.go(0.0, 0.33e-3 * 19 + 0.1e-3 * k, -0.2e-3 - 0.05e-3 * k)
+    for _ in range(3):
+        following.go(0.0, 0.33e-3 * 19 + 1.9e-3, -0.2e-3 - 0.95e-3)
+    assert following.zero.ended
+    assert following.zero.error_m == pytest.approx(-0.2e-3, abs=0.05e-3)
+
+
 def test_frames_without_a_valid_contact_are_left_out() -> None:
     following = Following()
     following.touch(-0.3e-3)
