@@ -2,7 +2,7 @@
 
 Each path runs with the learned estimator, on the true contact, which shows the error of control alone, and with the
 learned estimator where truth is sampled: the tip is one fitted to a real sensor; the network was trained over a spread
-of tips, or knows another one alone, or was adapted to this one by a few labelled frames. Errors are of the true
+of tips, or on one other tip, or was adapted to this one by a few labelled frames. Errors are of the true
 contact, so an estimation error counts by its effect on the arm.
 """
 
@@ -16,7 +16,7 @@ import numpy as np
 
 from touchcell.cell.analysis.run_folder import RunFolder, during, rms, tilt_deg, true_contacts
 from touchcell.cell.experiments.runner import ExperimentSpec, Scale
-from touchcell.cell.experiments.shape_truth import REAL_TIP, REAL_TIP_MODEL, SAMPLED, SPREAD_MODEL, sampled_truth
+from touchcell.cell.experiments.shape_truth import OTHER_TIP_MODEL, REAL_TIP, REAL_TIP_MODEL, SAMPLED, sampled_truth
 from touchcell.cell.experiments.table import Column
 from touchcell.cell.experiments.trials import Finished, Trial
 
@@ -41,8 +41,8 @@ def trials(scale: Scale) -> list[Trial]:
     }
     truth = {"truth": sampled_truth(SENSOR, ARM, REAL_TIP)}
     kinds |= {
-        f"learned over tips, {SAMPLED}": truth | {f"sensors.{SENSOR}.estimator.model": f"builtin:{SPREAD_MODEL}"},
         f"learned, {SAMPLED}": truth,
+        f"of one other tip, {SAMPLED}": truth | {f"sensors.{SENSOR}.estimator.model": f"builtin:{OTHER_TIP_MODEL}"},
         f"adapted, {SAMPLED}": truth | {f"sensors.{SENSOR}.estimator.model": f"builtin:{REAL_TIP_MODEL}"},
     }
     return [
