@@ -80,7 +80,7 @@ def test_devices_and_list_name_what_is_missing(lost: str, capsys: pytest.Capture
 def test_a_report_names_what_is_missing(lost: str, tmp_path: Path) -> None:
     import touchcell as tc
 
-    run = tc.run(tc.load_cell("surface_follow_sim", set={"task.distance_mm": 1}), out=tmp_path / "run")
+    run = tc.run(tc.load_cell("object_track_sim", set={"task.duration_s": 0.1}), out=tmp_path / "run")
     assert f"C extension {lost} is missing" in (run.folder / "summary.txt").read_text()
 
 
