@@ -24,7 +24,7 @@ from touchcell.tasks.surface_path import Guide, PathConfig
 
 _APPROACH_M = 0.02
 """The first contact is hardly farther from the start than this."""
-_ARM_SIGMA_M: Final = 0.1e-3
+_ARM_SIGMA_M: Final = 0.15e-3
 _BEND = 0.5
 """Share of a way by which its end may be elsewhere: on a plane tilted by 30 deg."""
 
@@ -57,7 +57,7 @@ class SurfaceFollowingConfig(ServoConfig):
 class ReadDepth:
     """What a model reads of a depth, by the arm's own motion as the sensor was pressed in.
 
-    The arm's motion tells an error to 0.1 mm. A model that claims to know better is left alone, unless the error is
+    The arm's motion tells an error to 0.15 mm. A model that claims to know better is left alone, unless the error is
     larger than both claims explain (empirical Bayes: the variance of its error is at least what shows).
     """
 
