@@ -101,6 +101,12 @@ class MeshConfig(MeshSurfaceConfig):
             raise ConfigError(f"cannot be read: {error.strerror}", key="file", value=self.file) from None
         return _loaded(path, self.unit, self.scale, self.repair, status.st_mtime_ns, status.st_size)
 
+    def remarks(self, tip_radius_m: float) -> Iterable[str]:
+        """Yield what a repair left open, and where a tip of ``tip_radius_m`` rests on two sides at once."""
+        if self.repair and (left := what_is_open(self.mesh())):
+            yield f"the repair left {left}; inside and outside are not known there, nor which edges can be touched"
+        yield from super().remarks(tip_radius_m)
+
     def modules(self) -> Mapping[str, str]:
         """Return the mesh library."""
         return _LIBRARIES
