@@ -219,6 +219,8 @@ class Scene:
         T_world_e = nearest_edge(self.surfaces, T_world_s, t_s, self.tip_radius_m)
         if T_world_e is None:
             return None
+        # {e} glides along with the tip: of a tip that leans along the edge the apex is not under the middle.
+        T_world_e[:3, 3] += float((T_world_s[:3, 3] - T_world_e[:3, 3]) @ T_world_e[:3, 1]) * T_world_e[:3, 1]
         return Stamped(se3.compose(se3.inverse(T_world_s), T_world_e), contact.t_ns, contact.seq)
 
     def objects(self) -> Stamped[Mapping[str, Array]]:
