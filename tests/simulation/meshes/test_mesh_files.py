@@ -339,6 +339,27 @@ def test_a_ledge_that_juts_out_a_little_under_an_edge_is_not_what_the_tip_follow
     assert found.point == pytest.approx(MM * np.array([40.0, y_mm, 20.0]))
 
 
+def test_a_closed_shell_whose_faces_lie_back_to_back_is_one_solid(tmp_path: Path) -> None:
+    made = load_mesh(as_drawing_programs_do(tmp_path / "shell.obj", BALL, sides=2), "m", repair=True)
+    assert not what_is_open(made)
+    assert len(made.faces) == len(BALL.faces)
+    assert volume_m3(made) == pytest.approx(volume_m3(BALL), rel=1e-3)
+
+
+def test_check_says_where_long_faces_leave_a_bend_to_guesses(tmp_path: Path) -> None:
+    notes = {}
+    for name, rows in (("fan", 3), ("fine", 30)):
+        x, y = (np.linspace(-0.06, 0.06, count) for count in (60, rows))
+        made = primitives.height_field(0.5 * (x[None] ** 2 - y[:, None] ** 2) / 0.1, 0.12 / 59)
+        stretched = made.vertices * np.array([1.0, 59.0 / (rows - 1), 1.0])
+        export(tmp_path / f"{name}.stl", TriangleMesh(stretched, made.faces))
+        (tmp_path / f"{name}.yaml").write_text(CELL.format(file=f"{name}.stl", unit="mm\n      repair: true"))
+        notes[name] = " ".join(plan_cell(tmp_path / f"{name}.yaml").notes)
+    assert "edges of up to 63 mm over a bend" in notes["fan"]
+    assert "`crease_deg: 0`" in notes["fan"]
+    assert "over a bend" not in notes["fine"]
+
+
 def test_check_says_what_a_repair_left_open(tmp_path: Path) -> None:
     export(tmp_path / "cup.stl", without(BALL, 24))
     (tmp_path / "c.yaml").write_text(CELL.format(file="cup.stl", unit="mm\n      repair: true"), encoding="utf-8")

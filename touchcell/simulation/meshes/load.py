@@ -189,6 +189,12 @@ def _without_empty_faces(mesh: TriangleMesh) -> TriangleMesh:
     return TriangleMesh(mesh.vertices, np.ascontiguousarray(kept[np.sort(first)]))
 
 
+def _is_drawn_twice(mesh: TriangleMesh) -> bool:
+    """Return whether most faces lie back to back, as of sheets that are to be seen from both sides."""
+    _, times = np.unique(np.sort(mesh.faces, axis=1), axis=0, return_counts=True)
+    return bool(2 * np.sum(times > 1) > len(times))
+
+
 def _without_inner_walls(mesh: TriangleMesh) -> TriangleMesh:
     """Drop faces that lie back to back: both, as between solids that touch, or one of two, of a sheet drawn twice."""
     _, first, same, times = np.unique(
@@ -229,7 +235,8 @@ def _mended(mesh: TriangleMesh) -> TriangleMesh:
     import trimesh
 
     edges = Edges.of(mesh.faces)
-    if edges.crowded_count and not edges.open_count and not what_is_open(separate := apart(mesh)):
+    solids = edges.crowded_count and not edges.open_count and not _is_drawn_twice(mesh)
+    if solids and not what_is_open(separate := apart(mesh)):
         return separate
     mesh = _without_inner_walls(mesh)
     made = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
