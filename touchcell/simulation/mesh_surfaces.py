@@ -63,8 +63,8 @@ class MeshSurfaceConfig(SurfaceConfig):
         coarse = guessed(self.mesh(), crease_rad)
         if coarse.share > _LEAST_GUESSED:
             yield (
-                f"{100.0 * coarse.share:.0f} % of it has edges of up to {1e3 * coarse.longest_m:.0f} mm over a bend: what "
-                f"is between their ends is guessed, {1e3 * coarse.most_m:.1f} mm off a straight line at "
+                f"{100.0 * coarse.share:.0f} % of it has edges of up to {1e3 * coarse.longest_m:.0f} mm over a bend: "
+                f"what is between their ends is guessed, {1e3 * coarse.most_m:.1f} mm off a straight line at "
                 f"({self._in_world(coarse.at)}) mm; export it finer, or keep it flat there with `crease_deg: 0`"
             )
         found = hollows(self.mesh(), crease_rad, tip_radius_m)
