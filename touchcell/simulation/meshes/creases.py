@@ -82,7 +82,9 @@ class Polylines:
         near = np.flatnonzero(squared < _FARTHEST_OVER_M**2)
         up = away[i] - away[near]
         height = up @ facing
-        over = (height > _LEAST_OVER_M) & (np.linalg.norm(up - height[:, None] * facing, axis=1) < _JUTS_OUT_M)
+        # Other sides of a corner or of a narrow ring, of a tip that leans, are not that much above.
+        aside = np.linalg.norm(up - height[:, None] * facing, axis=1)
+        over = (height > np.maximum(_STEEPEST * aside, _LEAST_OVER_M)) & (aside < _JUTS_OUT_M)
         if not over.any():
             return i
         # Nearest with an inner point, or with an end with which its neighbour is nearest, too.
@@ -107,6 +109,8 @@ class Polylines:
 _SAME_M = 1e-9
 _JUTS_OUT_M = 3e-3
 _LEAST_OVER_M = 0.1e-3
+_STEEPEST = 0.8
+"""Height over distance aside that a lean of the tip brings about, at most: 39 deg."""
 _FARTHEST_OVER_M = 8e-3
 """Tips are pressed in by less."""
 _FACING_COS = 0.5
