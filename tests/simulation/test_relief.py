@@ -6,6 +6,7 @@ import pytest
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 from touchcell.simulation.closed_forms import Box, Cylinder
+from touchcell.simulation.mesh_surfaces import DifferenceConfig
 from touchcell.simulation.meshes import primitives
 from touchcell.simulation.meshes.mesh_shape import MeshShape
 from touchcell.simulation.meshes.smoothing import TriangleMesh
@@ -103,3 +104,17 @@ def test_a_thin_bent_wall_feels_as_a_ball_does() -> None:
     assert solid is not None
     assert hollow is not None
     assert np.abs(hollow - solid).max() < 2e-4
+
+
+@pytest.mark.parametrize("x_mm", [36.0, 40.0, 41.5])
+@pytest.mark.parametrize("radius_mm", [37.5, 38.5])
+def test_a_hollow_part_feels_as_a_solid_one_does_beside_its_walls(x_mm: float, radius_mm: float) -> None:
+    """Of a shell open below, the inner walls are the nearest surface of much skin near the rim."""
+    pytest.importorskip("manifold3d")
+    disc = {"kind": "cylinder", "radius_mm": 40.0, "height_mm": 25.0}
+    hollow = {"kind": "cylinder", "radius_mm": radius_mm, "height_mm": 22.5}
+    shell = DifferenceConfig.model_validate({"kind": "difference", "parts": {"disc": disc, "hollow": hollow}}).shape()
+    thin, thick = felt(shell, x_mm=x_mm, z_mm=42.0), felt(Cylinder(0.04, 0.025), x_mm=x_mm, z_mm=42.0)
+    assert thin is not None
+    assert thick is not None
+    assert thin == pytest.approx(thick, abs=0.12e-3)

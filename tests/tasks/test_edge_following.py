@@ -65,6 +65,21 @@ def test_the_rim_of_a_disc_is_followed_once_around(direction: str, tmp_path: Pat
     assert len(edge) / 100.0 == pytest.approx(2.0 * math.pi * 50.0 / 30.0, rel=0.06)
 
 
+def test_a_tip_that_leans_along_the_edge_is_not_sheared_by_that(tmp_path: Path) -> None:
+    settings = {
+        "scene.surfaces": {"block": {"kind": "box", "size_mm": [80, 80, 20]}},
+        "arms.arm.start_pose_mm_deg": [38, 0, 45, 155, 0, 0],
+        "task.dimensions": 3,
+        "task.close_loop": False,
+        "task.distance_mm": 10,
+    }
+    result, edge, _ = run(settings, tmp_path)
+    assert result.outcome.value == "done", result.reason
+    assert np.abs(edge[:, 3] - edge[0, 3]).max() < 2.0
+    assert abs(edge[0, 3]) > 20.0
+    assert np.abs(edge[:, 1]).max() < 0.01
+
+
 def test_the_network_that_ships_follows_a_rim(tmp_path: Path) -> None:
     settings = {"task.close_loop": False, "task.distance_mm": 60}
     result, edge, task = run(settings, tmp_path, learned=True)

@@ -290,13 +290,19 @@ def way_over(
 
 
 def points_over(
-    surfaces: Sequence[Surface], T_world_s: Array, points: Array, height_m: float, reach_m: float
+    surfaces: Sequence[Surface],
+    T_world_s: Array,
+    points: Array,
+    height_m: float,
+    reach_m: float,
+    *,
+    of_edges: bool = False,
 ) -> Array | None:
     """Return where (n, 3), m, a tip's centre is at points (n, 2), m, of the plane in which its contact settles.
 
     The arguments are those of ``way_over``. The result is (n, 2, 3) with the outward normals of what is touched there;
     where nothing is below a point, it is the place in the plane, and nan; so is the normal where an edge is touched
-    from beyond its face.
+    from beyond its face, unless ``of_edges`` asks for it.
     """
     met = first_contact(surfaces, T_world_s[:3, 3], T_world_s[:3, 2], height_m, reach_m)
     if met is None:
@@ -310,7 +316,7 @@ def points_over(
         below = first_contact(surfaces, above, R[:, 2], height_m, 2.0 * reach_m)
         if below is None:
             below = place, np.full(3, np.nan)
-        elif _is_beyond_face(surfaces, *below, height_m):
+        elif not of_edges and _is_beyond_face(surfaces, *below, height_m):
             below = below[0], np.full(3, np.nan)
         found.append(below)
     return np.array(found)

@@ -18,7 +18,7 @@ from touchcell.input_file import InputFile
 from touchcell.plugin_section import PluginSection
 from touchcell.simulation.combine import Operation, Part, combined
 from touchcell.simulation.meshes import primitives
-from touchcell.simulation.meshes.hollows import hollows
+from touchcell.simulation.meshes.hollows import guessed, hollows
 from touchcell.simulation.meshes.load import INSTALL, SUFFIXES, Unit, load_mesh, mesh_library, what_is_open
 from touchcell.simulation.meshes.mesh_shape import MeshShape
 from touchcell.simulation.meshes.smoothing import TriangleMesh
@@ -29,6 +29,7 @@ from touchcell.simulation.surfaces import Surface
 
 _LIBRARIES = {"trimesh": INSTALL}
 _SOLIDS = {**_LIBRARIES, "manifold3d": INSTALL}
+_LEAST_GUESSED = 0.05
 
 
 class MeshSurfaceConfig(SurfaceConfig):
@@ -57,12 +58,19 @@ class MeshSurfaceConfig(SurfaceConfig):
             yield error
 
     def remarks(self, tip_radius_m: float) -> Iterable[str]:
-        """Yield where a tip of ``tip_radius_m`` rests on two sides at once."""
-        found = hollows(self.mesh(), math.radians(self.crease_deg), tip_radius_m)
+        """Yield where a tip of ``tip_radius_m`` rests on two sides at once, and where the mesh is too coarse."""
+        crease_rad = math.radians(self.crease_deg)
+        coarse = guessed(self.mesh(), crease_rad)
+        if coarse.share > _LEAST_GUESSED:
+            yield (
+                f"{100.0 * coarse.share:.0f} % of it has edges of up to {1e3 * coarse.longest_m:.0f} mm over a bend: "
+                f"what is between their ends is guessed, {1e3 * coarse.most_m:.1f} mm off a straight line at "
+                f"({self._in_world(coarse.at)}) mm; export it finer, or keep it flat there with `crease_deg: 0`"
+            )
+        found = hollows(self.mesh(), crease_rad, tip_radius_m)
         if not found.any or found.at is None:
             return
-        T = se3.from_euler_mm_deg(self.pose_mm_deg)
-        at = ", ".join(f"{1e3 * each:.0f}" for each in T[:3, :3] @ found.at + T[:3, 3])
+        at = self._in_world(found.at)
         what = []
         if found.share > 0.0:
             what.append(
@@ -74,6 +82,10 @@ class MeshSurfaceConfig(SurfaceConfig):
             f"the tip of {1e3 * tip_radius_m:g} mm does not fit everywhere: {' and '.join(what)}, as at ({at}) mm; "
             "there it rests on two sides, with no one depth and tilt to hold"
         )
+
+    def _in_world(self, p: Array) -> str:
+        T = se3.from_euler_mm_deg(self.pose_mm_deg)
+        return ", ".join(f"{1e3 * each:.0f}" for each in T[:3, :3] @ p + T[:3, 3])
 
 
 class MeshConfig(MeshSurfaceConfig):
@@ -100,6 +112,12 @@ class MeshConfig(MeshSurfaceConfig):
         except OSError as error:
             raise ConfigError(f"cannot be read: {error.strerror}", key="file", value=self.file) from None
         return _loaded(path, self.unit, self.scale, self.repair, status.st_mtime_ns, status.st_size)
+
+    def remarks(self, tip_radius_m: float) -> Iterable[str]:
+        """Yield what a repair left open, and where a tip of ``tip_radius_m`` rests on two sides at once."""
+        if self.repair and (left := what_is_open(self.mesh())):
+            yield f"the repair left {left}; inside and outside are not known there, nor which edges can be touched"
+        yield from super().remarks(tip_radius_m)
 
     def modules(self) -> Mapping[str, str]:
         """Return the mesh library."""

@@ -13,8 +13,9 @@ from typing import Final, Protocol, runtime_checkable
 
 import numpy as np
 
+from touchcell.geometry.surface_point import SurfacePoint
 from touchcell.geometry.types import Array
-from touchcell.simulation.surfaces import Plane, Surface
+from touchcell.simulation.surfaces import Plane, Shape, Surface
 
 _RINGS: Final = 6
 _STEP_RAD: Final = math.radians(11.0)
@@ -24,6 +25,13 @@ _REACH_M: Final = 6e-3
 _THIN: Final = 0.98
 """Share of its depth below the tangent plane, below which skin may have come through a wall."""
 _OTHER_SIDE_COS: Final = -0.3
+_SIDEWAYS_COS: Final = 0.7
+"""Above it a surface is seen from the side of the touched one."""
+_BESIDE_M: Final = 0.2e-3
+_OVER: Final = np.array([0.4, 0.75, 0.96])
+"""Where between a wall and the tangent plane there may be what covers it."""
+_ACROSS_M: Final = 8e-3
+_UPRIGHT: Final = 0.3
 _CLEAR_M: Final = 1e-3
 
 
@@ -103,15 +111,70 @@ def felt_relief(surface: Surface, T_world_s: Array, t_s: float, directions: Arra
     above = (points - nearest.point) @ nearest.normal
     asked = above < _REACH_M
     distances = np.full(len(points), np.inf)
-    if isinstance(shape, ManyDistances):
-        distances[asked] = shape.distances(points[asked])
-    else:
-        distances[asked] = [shape.nearest(p).distance_m for p in points[asked]]
+    distances[asked] = _distances(shape, points[asked])
     pressed_in = np.maximum(-distances, 0.0)
-    # Within a wall that is thinner than the tip presses in, the nearest surface is the other side of the wall.
-    for i in np.flatnonzero(pressed_in < _THIN * -above):
-        if float(shape.nearest(points[i]).normal @ nearest.normal) < _OTHER_SIDE_COS:
-            outside_m = -above[i] + _CLEAR_M
-            pressed_in[i] = max(outside_m - shape.nearest(points[i] + outside_m * nearest.normal).distance_m, 0.0)
+    # Of a wall that is thinner than the tip presses in, the nearest surface is often one that the tip cannot come to.
+    below = np.flatnonzero(pressed_in < _THIN * -above)
+    if len(below):
+        pressed_in[below] = _from_outside(shape, nearest, points[below], pressed_in[below])
     relief: Array = pressed_in - np.maximum(-above, 0.0)
     return relief
+
+
+def _from_outside(shape: Shape, touched: SurfacePoint, points: Array, pressed_in: Array) -> Array:
+    """Return (k,) m how far ``points`` (k, 3) are pressed in, from surfaces that can be come to from outside.
+
+    Others are the far side of a wall, and walls of a hollow with the touched face over them.
+
+    Args:
+        shape: what is touched.
+        touched: its point that is nearest to the tip's centre.
+        points: of the undeformed skin, below the tangent plane.
+        pressed_in: (k,) m distance to any surface.
+    """
+    normal = touched.normal
+    near = [shape.nearest(p) for p in points]
+    normals, places = np.array([each.normal for each in near]), np.array([each.point for each in near])
+    facing = normals @ normal
+    hidden = facing < _OTHER_SIDE_COS
+    sideways = np.flatnonzero(~hidden & (facing < _SIDEWAYS_COS))
+    if len(sideways):
+        beside = places[sideways] + _BESIDE_M * normals[sideways]
+        over_m = (touched.point - beside) @ normal
+        over = beside[:, None] + (over_m[:, None] * _OVER)[..., None] * normal
+        covered = (_distances(shape, over.reshape(-1, 3)).reshape(len(sideways), -1) < 0.0).any(axis=1)
+        hidden[sideways[covered & (over_m > 0.0)]] = True
+    which = np.flatnonzero(hidden)
+    if not len(which):
+        return pressed_in
+    found = pressed_in.copy()
+    p = points[which]
+    outside_m = (touched.point - p) @ normal + _CLEAR_M
+    from_above = outside_m - _distances(shape, p + outside_m[:, None] * normal)
+    # The part ends aside: beyond a wall that stands upright, or towards or away from the touched point.
+    ways = np.stack([-normals[which], p - touched.point, touched.point - p])
+    ways -= (ways @ normal)[..., None] * normal
+    length = np.linalg.norm(ways, axis=2)
+    ways *= (_ACROSS_M / np.maximum(length, 1e-9))[..., None]
+    across = _distances(shape, (p + ways).reshape(-1, 3)).reshape(3, -1)
+    known = (across > 0.0) & (length > np.array([_UPRIGHT, _BESIDE_M, _BESIDE_M])[:, None])
+    from_aside = np.where(known, _ACROSS_M - across, np.inf)
+    best = from_aside.argmin(axis=0)
+    found[which] = from_above
+    # Straight to the outer face that was found so.
+    ends = np.flatnonzero(known.any(axis=0))
+    if len(ends):
+        outer = np.array([shape.nearest(p[i] + ways[best[i], i]).normal for i in ends])
+        outer -= (outer @ normal)[:, None] * normal
+        outer *= (_ACROSS_M / np.maximum(np.linalg.norm(outer, axis=1), 1e-9))[:, None]
+        straight = _distances(shape, p[ends] + outer)
+        aside = np.where(straight > 0.0, _ACROSS_M - straight, from_aside[best[ends], ends])
+        found[which[ends]] = np.minimum(from_above[ends], aside)
+    found[which] = np.maximum(found[which], 0.0)
+    return found
+
+
+def _distances(shape: Shape, points: Array) -> Array:
+    if isinstance(shape, ManyDistances):
+        return shape.distances(points)
+    return np.array([shape.nearest(p).distance_m for p in points])

@@ -219,6 +219,8 @@ class Scene:
         T_world_e = nearest_edge(self.surfaces, T_world_s, t_s, self.tip_radius_m)
         if T_world_e is None:
             return None
+        # {e} glides along with the tip: of a tip that leans along the edge the apex is not under the middle.
+        T_world_e[:3, 3] += float((T_world_s[:3, 3] - T_world_e[:3, 3]) @ T_world_e[:3, 1]) * T_world_e[:3, 1]
         return Stamped(se3.compose(se3.inverse(T_world_s), T_world_e), contact.t_ns, contact.seq)
 
     def objects(self) -> Stamped[Mapping[str, Array]]:
@@ -546,11 +548,14 @@ class SceneConfig(Section, SceneSection):
         held = se3.inverse(motion.pose(0.0)) @ start
         return np.array([(motion.pose(t_s) @ held)[:3] for t_s in np.linspace(0.0, lasts_s, _RIDE_STEPS)])
 
-    def points_over(self, T_world_s: Array, points: Array, depth_m: float, reach_m: float) -> Array | None:
+    def points_over(
+        self, T_world_s: Array, points: Array, depth_m: float, reach_m: float, *, of_edges: bool = False
+    ) -> Array | None:
         """Return places and normals over what stands still; None where anything moves, or nothing is touched."""
         if not (surfaces := self._still()):
             return None
-        return points_over(surfaces, T_world_s, points, 1e-3 * self.tip.radius_mm - depth_m, reach_m)
+        height_m = 1e-3 * self.tip.radius_mm - depth_m
+        return points_over(surfaces, T_world_s, points, height_m, reach_m, of_edges=of_edges)
 
     def way_along_edge(
         self, T_world_s: Array, distance_m: float, reach_m: float, *, backward: bool = False

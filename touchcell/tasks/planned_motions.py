@@ -76,6 +76,7 @@ class PlannedSlide:
         state: of the task meanwhile; empty if it is not known.
         corners_m: of a way that bends, in the plane of the first contact, along the sensor's x and y axes; it gets that
             far from its start somewhere. Empty for a straight one.
+        way_m: points of the whole of such a way, a few millimetres apart.
         known: False where nothing says where it begins.
     """
 
@@ -86,6 +87,7 @@ class PlannedSlide:
     depth_m: float
     state: str = ""
     corners_m: tuple[tuple[float, float], ...] = ()
+    way_m: tuple[tuple[float, float], ...] = ()
     known: bool = True
 
 

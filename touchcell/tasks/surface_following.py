@@ -20,7 +20,7 @@ from touchcell.tasks.interface import DEPTH, DISTANCE, SPEED
 from touchcell.tasks.planned_motions import PlannedMotion, PlannedSlide
 from touchcell.tasks.planned_places import PlannedPlace
 from touchcell.tasks.servoing import ARM, ServoConfig, one_arm_task, servo_motions
-from touchcell.tasks.surface_path import Guide, PathConfig
+from touchcell.tasks.surface_path import Guide, PathConfig, along
 
 _APPROACH_M = 0.02
 """The first contact is hardly farther from the start than this."""
@@ -207,6 +207,7 @@ def _motions(config: SurfaceFollowingConfig) -> Iterator[PlannedMotion]:
         1e-3 * config.depth_mm,
         "run",
         corners_m=() if config.path is None else tuple(along_m),
+        way_m=() if config.path is None else tuple(along(config.path.points())),
     )
 
 

@@ -19,6 +19,8 @@ from touchcell.tasks.interface import TaskConfig
 
 _STEP_RAD: Final = math.radians(10.0)
 _MOST_LINES, _MOST_TURNS = 10_000, 10_000
+_APART_M: Final = 4e-3
+_MOST_POINTS: Final = 400
 # Where the surface is steeper than this, the way to go is taken along the surface, not exactly below the path.
 _STEEPEST_COS: Final = 0.3
 
@@ -122,6 +124,13 @@ class ThroughConfig(TaskConfig):
 
 PathConfig = Annotated[RasterConfig | SpiralConfig | ThroughConfig, Field(discriminator="kind")]
 """The ``path:`` of surface following."""
+
+
+def along(points: list[Point]) -> list[Point]:
+    """Return points, m, of the path with these corners: 4 mm apart, or on a long path at most 400."""
+    path = Path(points)
+    count = min(max(math.ceil(path.length_m / _APART_M), 1), _MOST_POINTS)
+    return [path.point(path.length_m * i / count) for i in range(1, count + 1)]
 
 
 class Guide:

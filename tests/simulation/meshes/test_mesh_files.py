@@ -292,3 +292,76 @@ def test_solids_that_share_a_wall_or_an_edge_are_closed_by_a_repair(
     assert volume_m3(made) == pytest.approx(64e-6)
     # Without those of the seam, whose two sides lie in one plane.
     assert len(MeshShape(made, 0.5).edges) == creases
+
+
+def box_from(low_mm: tuple[float, ...], high_mm: tuple[float, ...]) -> TriangleMesh:
+    low, high = MM * np.array(low_mm), MM * np.array(high_mm)
+    made = primitives.box(high - low)
+    return TriangleMesh(made.vertices - made.vertices.min(axis=0) + low, made.faces)
+
+
+PLATE = box_from((-40, -40, 17.5), (40, 40, 20))
+POST = box_from((20, -5, 0), (40.05, 5, 17.5))
+
+
+@pytest.mark.parametrize("left_out", [False, True], ids=["part by part", "equal faces once"])
+def test_parts_of_an_assembly_that_overlap_with_equal_faces_are_made_one_by_a_repair(
+    tmp_path: Path, left_out: bool
+) -> None:
+    lower = box_from((20, -5, 0), (40.05, 5, 10))
+    faces = both(both(PLATE, lower), POST)
+    merged = trimesh.Trimesh(faces.vertices, faces.faces, process=False)
+    merged.merge_vertices()
+    if left_out:
+        _, first = np.unique(np.sort(merged.faces, axis=1), axis=0, return_index=True)
+        merged.update_faces(np.isin(np.arange(len(merged.faces)), first))
+    path = export(tmp_path / "assembly.ply", TriangleMesh(np.asarray(merged.vertices), np.asarray(merged.faces)))
+    with pytest.raises(ConfigError, match="edges of more than two faces"):
+        load_mesh(path, "mm", repair=False)
+    made = load_mesh(path, "mm", repair=True)
+    assert not what_is_open(made)
+    assert volume_m3(made) == pytest.approx(volume_m3(PLATE) + volume_m3(POST), rel=1e-4)
+
+
+def test_the_face_with_which_a_solid_stands_against_another_is_no_edge(tmp_path: Path) -> None:
+    inside = TriangleMesh(POST.vertices - MM * np.array([20.0, 0.0, 0.0]), POST.faces)
+    made = load_mesh(export(tmp_path / "touching.stl", both(PLATE, inside)), "mm", repair=False)
+    upwards = MeshShape(made, 0.5).edges.middle_normals[..., 2].max(axis=1) > 0.5
+    heights = MeshShape(made, 0.5).edges.starts[upwards][:, 2]
+    assert heights == pytest.approx(np.full(4, 20 * MM))
+
+
+@pytest.mark.parametrize("y_mm", [-8.0, -5.0, 0.0, 3.0])
+def test_a_ledge_that_juts_out_a_little_under_an_edge_is_not_what_the_tip_follows(tmp_path: Path, y_mm: float) -> None:
+    made = load_mesh(export(tmp_path / "ledge.stl", both(PLATE, POST)), "mm", repair=False)
+    apex = MM * np.array([40.2, y_mm, 17.0])
+    found = MeshShape(made, 0.5).edges.nearest(apex, np.array([0.0, 0.0, 1.0]))
+    assert found.point == pytest.approx(MM * np.array([40.0, y_mm, 20.0]))
+
+
+def test_a_closed_shell_whose_faces_lie_back_to_back_is_one_solid(tmp_path: Path) -> None:
+    made = load_mesh(as_drawing_programs_do(tmp_path / "shell.obj", BALL, sides=2), "m", repair=True)
+    assert not what_is_open(made)
+    assert len(made.faces) == len(BALL.faces)
+    assert volume_m3(made) == pytest.approx(volume_m3(BALL), rel=1e-3)
+
+
+def test_check_says_where_long_faces_leave_a_bend_to_guesses(tmp_path: Path) -> None:
+    notes = {}
+    for name, rows in (("fan", 3), ("fine", 30)):
+        x, y = (np.linspace(-0.06, 0.06, count) for count in (60, rows))
+        made = primitives.height_field(0.5 * (x[None] ** 2 - y[:, None] ** 2) / 0.1, 0.12 / 59)
+        stretched = made.vertices * np.array([1.0, 59.0 / (rows - 1), 1.0])
+        export(tmp_path / f"{name}.stl", TriangleMesh(stretched, made.faces))
+        (tmp_path / f"{name}.yaml").write_text(CELL.format(file=f"{name}.stl", unit="mm\n      repair: true"))
+        notes[name] = " ".join(plan_cell(tmp_path / f"{name}.yaml").notes)
+    assert "edges of up to 63 mm over a bend" in notes["fan"]
+    assert "`crease_deg: 0`" in notes["fan"]
+    assert "over a bend" not in notes["fine"]
+
+
+def test_check_says_what_a_repair_left_open(tmp_path: Path) -> None:
+    export(tmp_path / "cup.stl", without(BALL, 24))
+    (tmp_path / "c.yaml").write_text(CELL.format(file="cup.stl", unit="mm\n      repair: true"), encoding="utf-8")
+    notes = plan_cell(tmp_path / "c.yaml").notes
+    assert any("the repair left" in note and "edges of one face only" in note for note in notes), notes

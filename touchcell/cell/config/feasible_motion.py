@@ -318,9 +318,15 @@ def _over_border(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
     cones = _cones(plan)
     R = first.T_world_base[:3, :3]
     for motion in slides:
-        corners_m = np.array(motion.corners_m).reshape(-1, 2)
-        over = first.scene.points_over(first.T_world_sensor, corners_m, motion.depth_m, first.reach_m)
-        for (x, y), (_, normal) in zip(1e3 * corners_m, () if over is None else over, strict=False):
+        corners_m, way_m = (np.array(each).reshape(-1, 2) for each in (motion.corners_m, motion.way_m))
+        # An edge is no place to end, but may be crossed where it does not lean the tip too far.
+        over = [
+            first.scene.points_over(first.T_world_sensor, at_m, motion.depth_m, first.reach_m, of_edges=of_edges)
+            for at_m, of_edges in ((corners_m, False), (way_m, True))
+        ]
+        places_mm = 1e3 * np.concatenate([corners_m, way_m])
+        met = () if over[0] is None or over[1] is None else np.concatenate([over[0], over[1]])
+        for (x, y), (_, normal) in zip(places_mm, met, strict=False):
             if np.isnan(normal).any():
                 yield file.problem(
                     ("task", *motion.key),

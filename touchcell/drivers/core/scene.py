@@ -183,11 +183,14 @@ class SceneSection(BaseModel):
         """
         return None
 
-    def points_over(self, T_world_s: Array, points: Array, depth_m: float, reach_m: float) -> Array | None:
+    def points_over(
+        self, T_world_s: Array, points: Array, depth_m: float, reach_m: float, *, of_edges: bool = False
+    ) -> Array | None:
         """Return where (n, 3), m, the tip is at points (n, 2), m, of the plane of its first contact.
 
-        The result is (n, 2, 3): with each place the outward normal of the face that is touched, nan where none is.
-        None where it makes no contact, or what it touches moves. The other arguments are those of ``way_over``.
+        The result is (n, 2, 3): with each place the outward normal of the face that is touched, nan where none is; with
+        ``of_edges`` also that from an edge which is touched from beyond its face. None where it makes no contact, or
+        what it touches moves. The other arguments are those of ``way_over``.
         """
         return None
 

@@ -52,7 +52,8 @@ class Polylines:
         """Return the nearest point of any piece to ``p`` (3,) m.
 
         With ``facing`` (3,), a unit vector, only pieces with a face whose outside is towards it count, to 60 deg;
-        all of them where there is none.
+        all of them where there is none. An edge that juts out by less than 3 mm under another gives way to that: it is
+        nearer to an apex pressed in between both, but the tip is pressed against the upper one.
         """
         off = p - self.starts
         t = np.clip(np.einsum("kc,kc->k", off, self._side) / self._squared, 0.0, 1.0)
@@ -62,6 +63,8 @@ class Polylines:
             seen = (self.middle_normals @ facing).max(axis=1) >= _FACING_COS
             squared = np.where(seen, squared, np.inf) if seen.any() else squared
         i = int(np.argmin(squared))
+        if facing is not None:
+            i = self._over(i, t, away, squared, facing)
         share = t[i]
         tangent = (1.0 - share) * self._tangents[i, 0] + share * self._tangents[i, 1]
         normals = (1.0 - share) * self._normals[i, 0] + share * self._normals[i, 1]
@@ -73,6 +76,21 @@ class Polylines:
             if facing is not None and not 0.0 < share < 1.0
             else None,
         )
+
+    def _over(self, i: int, t: Array, away: Array, squared: Array, facing: Array) -> int:
+        """Return the uppermost of the pieces over piece i, among those that are not only near with their neighbours."""
+        near = np.flatnonzero(squared < _FARTHEST_OVER_M**2)
+        up = away[i] - away[near]
+        height = up @ facing
+        # Other sides of a corner or of a narrow ring, of a tip that leans, are not that much above.
+        aside = np.linalg.norm(up - height[:, None] * facing, axis=1)
+        over = (height > np.maximum(_STEEPEST * aside, _LEAST_OVER_M)) & (aside < _JUTS_OUT_M)
+        if not over.any():
+            return i
+        # Nearest with an inner point, or with an end with which its neighbour is nearest, too.
+        same = np.abs(away[near, None] - away[None, near]).max(axis=2) < _SAME_M
+        over &= ((t[near] > 0.0) & (t[near] < 1.0)) | (same.sum(axis=1) > 1)
+        return int(near[np.argmax(np.where(over, height, -np.inf))]) if over.any() else i
 
     def _outwards_at(self, vertex: Array, facing: Array) -> Array:
         ends = (np.abs(self.starts - vertex).max(axis=1) < _SAME_M) | (np.abs(self.ends - vertex).max(axis=1) < _SAME_M)
@@ -89,6 +107,12 @@ class Polylines:
 
 
 _SAME_M = 1e-9
+_JUTS_OUT_M = 3e-3
+_LEAST_OVER_M = 0.1e-3
+_STEEPEST = 0.8
+"""Height over distance aside that a lean of the tip brings about, at most: 39 deg."""
+_FARTHEST_OVER_M = 8e-3
+"""Tips are pressed in by less."""
 _FACING_COS = 0.5
 _CORNER_COS = np.cos(np.radians(35.0))
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from touchcell.errors import ConfigError
 from touchcell.simulation.meshes.indexing import connected, has_three_corners
-from touchcell.simulation.meshes.pieces import apart, as_one, has_piece_inside_out, pieces_of
+from touchcell.simulation.meshes.pieces import apart, as_one, has_piece_inside_out, pieces_of, solids_in_order
 from touchcell.simulation.meshes.smoothing import Edges, TriangleMesh
 
 Unit = Literal["mm", "m", "inch"]
@@ -89,11 +89,11 @@ def load_mesh(path: Path, unit: Unit, *, scale: float = 1.0, repair: bool) -> Tr
     _require_likely_size(path, scale * np.asarray(loaded.vertices), unit)
     loaded.apply_scale(scale)
     loaded.merge_vertices(merge_tex=True, merge_norm=True)
-    mesh = _without_empty_faces(_triangles(loaded, unit))
+    mesh = _triangles(loaded, unit)
     if repair:
-        mesh = with_thickness(_repaired(mesh), SHEET_M)
         with mesh_library("file", str(path)):
-            return mesh if what_is_open(mesh) else as_one(mesh)
+            return _repaired(mesh)
+    mesh = _without_empty_faces(mesh)
     if problem := what_is_open(mesh):
         raise ConfigError(
             f"does not enclose a volume: {problem}",
@@ -106,9 +106,11 @@ def load_mesh(path: Path, unit: Unit, *, scale: float = 1.0, repair: bool) -> Tr
         hint = "`repair: true` turns its faces round"
         raise ConfigError("is inside out: its normals point inwards", key="file", value=str(path), hint=hint)
     with mesh_library("file", str(path)):
-        if as_one(mesh) is not mesh:
-            hint = "`repair: true` makes them one"
-            raise ConfigError("has solids that reach into each other", key="file", value=str(path), hint=hint)
+        # Solids that only touch are one to whoever touches them.
+        mesh, reach = as_one(mesh)
+    if reach:
+        hint = "`repair: true` makes them one"
+        raise ConfigError("has solids that reach into each other", key="file", value=str(path), hint=hint)
     return mesh
 
 
@@ -187,6 +189,12 @@ def _without_empty_faces(mesh: TriangleMesh) -> TriangleMesh:
     return TriangleMesh(mesh.vertices, np.ascontiguousarray(kept[np.sort(first)]))
 
 
+def _is_drawn_twice(mesh: TriangleMesh) -> bool:
+    """Return whether most faces lie back to back, as of sheets that are to be seen from both sides."""
+    _, times = np.unique(np.sort(mesh.faces, axis=1), axis=0, return_counts=True)
+    return bool(2 * np.sum(times > 1) > len(times))
+
+
 def _without_inner_walls(mesh: TriangleMesh) -> TriangleMesh:
     """Drop faces that lie back to back: both, as between solids that touch, or one of two, of a sheet drawn twice."""
     _, first, same, times = np.unique(
@@ -201,17 +209,40 @@ def _without_inner_walls(mesh: TriangleMesh) -> TriangleMesh:
 
 
 def _repaired(mesh: TriangleMesh) -> TriangleMesh:
+    mesh = _welded(mesh, WELD_M)
+    mesh = TriangleMesh(mesh.vertices, np.ascontiguousarray(mesh.faces[has_three_corners(mesh.faces)]))
+    solids: TriangleMesh | None = None
+    if Edges.of(mesh.faces).crowded_count:
+        solids, mesh = solids_in_order(mesh)
+    if not len(mesh.faces) and solids is not None:
+        return as_one(solids)[0]
+    mended = with_thickness(_mended(_without_empty_faces(mesh)), SHEET_M)
+    if solids is None:
+        return mended if what_is_open(mended) else as_one(mended)[0]
+    # What belongs to an assembly lacks faces where other parts have the same ones.
+    closed = _with_holes_closed(mended, len(mended.faces))
+    if not what_is_open(closed):
+        return as_one(_together(solids, closed))[0]
+    return _together(as_one(solids)[0], mended)
+
+
+def _together(one: TriangleMesh, other: TriangleMesh) -> TriangleMesh:
+    faces = np.concatenate([one.faces, other.faces + np.int32(len(one.vertices))])
+    return TriangleMesh(np.concatenate([one.vertices, other.vertices]), faces)
+
+
+def _mended(mesh: TriangleMesh) -> TriangleMesh:
     import trimesh
 
-    mesh = _without_empty_faces(_welded(mesh, WELD_M))
     edges = Edges.of(mesh.faces)
-    if edges.crowded_count and not edges.open_count and not what_is_open(separate := apart(mesh)):
-        return as_one(separate, touching=True)
+    solids = edges.crowded_count and not edges.open_count and not _is_drawn_twice(mesh)
+    if solids and not what_is_open(separate := apart(mesh)):
+        return separate
     mesh = _without_inner_walls(mesh)
     made = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     trimesh.repair.fix_winding(made)
     oriented = _as_most_were(mesh, _triangles(made, "m"))
-    return _with_outside_out(_with_holes_closed(_without_empty_faces(oriented)))
+    return _with_outside_out(_with_holes_closed(_without_empty_faces(oriented), LARGEST_HOLE))
 
 
 def _welded(mesh: TriangleMesh, distance_m: float) -> TriangleMesh:
@@ -302,8 +333,8 @@ def _with_outside_out(mesh: TriangleMesh) -> TriangleMesh:
     return TriangleMesh(mesh.vertices, np.ascontiguousarray(faces))
 
 
-def _with_holes_closed(mesh: TriangleMesh) -> TriangleMesh:
-    """Close each ring of up to LARGEST_HOLE open edges by a fan; its own border and larger holes stay open."""
+def _with_holes_closed(mesh: TriangleMesh, largest: int) -> TriangleMesh:
+    """Close each ring of up to ``largest`` open edges by a fan; larger holes stay open."""
     face, edge = np.nonzero(Edges.of(mesh.faces).other < 0)
     start, end = mesh.faces[face, edge].tolist(), mesh.faces[face, (edge + 1) % 3].tolist()
     onwards = dict(zip(start, end, strict=True))
@@ -312,6 +343,6 @@ def _with_holes_closed(mesh: TriangleMesh) -> TriangleMesh:
         ring = [next(iter(onwards))]
         while (after := onwards.pop(ring[-1], None)) is not None and after != ring[0]:
             ring.append(after)
-        if after is not None and 3 <= len(ring) <= LARGEST_HOLE:
+        if after is not None and 3 <= len(ring) <= largest:
             lids += [(ring[0], ring[i + 1], ring[i]) for i in range(1, len(ring) - 1)]
     return TriangleMesh(mesh.vertices, np.concatenate([mesh.faces, np.array(lids, np.int32).reshape(-1, 3)]))

@@ -12,7 +12,10 @@ from touchcell.simulation.meshes.indexing import coincident_as_one, connected, h
 from touchcell.simulation.meshes.smoothing import Edges, TriangleMesh
 
 _SHARED_M3: Final = 1e-9
+_HIDDEN_M2: Final = 1e-6
+"""Area of both faces where solids touch, from which they are made one: a rim there is no edge that can be touched."""
 _APART_M: Final = 1e-6
+_FEWEST_FACES: Final = 4
 
 
 def pieces_of(edges: Edges) -> NDArray[np.int64]:
@@ -26,18 +29,54 @@ def volume_m3(mesh: TriangleMesh) -> float:
     return float(_volumes(mesh).sum())
 
 
-def as_one(mesh: TriangleMesh, *, touching: bool = False) -> TriangleMesh:
-    """Return a closed mesh with solids that reach into each other made one; ``mesh`` itself where none do.
+def solids_in_order(mesh: TriangleMesh) -> tuple[TriangleMesh | None, TriangleMesh]:
+    """Return the solids that a file has one after another, none of which shares corners with another, and other faces.
 
-    Of two such solids each has faces inside the other, which nothing touches and on which skin, that reaches below the
-    surface, would be outside. Cavities, whose faces look into a solid, stay as they are. With ``touching`` solids
-    that do no more than touch are made one too.
+    Programs write an assembly part by part, so the faces of each are a stretch whose edges all meet each other, also
+    where parts reach into each other or share walls. None where no stretch of faces encloses a volume.
+    """
+    start, end = mesh.faces.astype(np.int64), np.roll(mesh.faces, -1, axis=1).astype(np.int64)
+    low, high = np.minimum(start, end), np.maximum(start, end)
+    _, edge = np.unique(low * len(mesh.vertices) + high, return_inverse=True)
+    # Each edge counts a number of its own, up or down: over a stretch that is closed they add up to nothing.
+    own = np.random.default_rng(0).integers(-(2**62), 2**62, int(edge.max()) + 1)
+    so_far = np.concatenate([[0], np.cumsum(np.where(start == low, 1, -1) * own[edge.reshape(start.shape)])[2::3]])
+    volume = np.concatenate([[0.0], np.cumsum(_volumes(mesh))])
+    following: dict[int, int] = {}
+    ends = np.full(len(so_far), -1)
+    for i in range(len(so_far) - 1, -1, -1):
+        ends[i] = following.get(int(so_far[i]), -1)
+        following[int(so_far[i])] = i
+    solids, rest, i = [], np.ones(len(mesh.faces), bool), 0
+    while i < len(mesh.faces):
+        j = int(ends[i])
+        if j - i >= _FEWEST_FACES and volume[j] - volume[i] > _SHARED_M3:
+            solids.append(mesh.faces[i:j])
+            rest[i:j] = False
+        i = max(j, i + 1)
+    if not solids:
+        return None, mesh
+    count = len(mesh.vertices)
+    faces = np.concatenate([each + k * count for k, each in enumerate(solids)]).astype(np.int64)
+    used, renumbered = np.unique(faces, return_inverse=True)
+    made = TriangleMesh(mesh.vertices[used % count], np.ascontiguousarray(renumbered.reshape(-1, 3), dtype=np.int32))
+    return made, TriangleMesh(mesh.vertices, np.ascontiguousarray(mesh.faces[rest]))
+
+
+def as_one(mesh: TriangleMesh) -> tuple[TriangleMesh, bool]:
+    """Return a closed mesh with solids that touch or reach into each other made one, and whether any reach.
+
+    It is ``mesh`` itself where none do either.
+
+    Of two such solids each has faces inside or against the other, which nothing touches and on which skin, that reaches
+    below the surface, would be outside; the rims of these faces are no edges to follow. Cavities, whose faces look
+    into a solid, stay as they are.
     """
     piece = pieces_of(Edges.of(mesh.faces))
     piece = np.unique(piece, return_inverse=True)[1]
     solid = np.bincount(piece, _volumes(mesh)) > 0.0
-    if solid.sum() < 2 or not (touching or _may_meet(*_boxes(mesh, piece), solid)):
-        return mesh
+    if solid.sum() < 2 or not _may_meet(*_boxes(mesh, piece), solid):
+        return mesh, False
     from manifold3d import Manifold, Mesh, OpType
 
     solids = []
@@ -45,8 +84,11 @@ def as_one(mesh: TriangleMesh, *, touching: bool = False) -> TriangleMesh:
         used, faces = np.unique(mesh.faces[piece == number], return_inverse=True)
         solids.append(Manifold(Mesh(mesh.vertices[used].astype(np.float32), faces.reshape(-1, 3).astype(np.uint32))))
     joined = Manifold.batch_boolean(solids, OpType.Add)
-    if not touching and sum(each.volume() for each in solids) - joined.volume() <= _SHARED_M3:
-        return mesh
+    shared_m3 = sum(each.volume() for each in solids) - joined.volume()
+    hidden_m2 = sum(each.surface_area() for each in solids) - joined.surface_area()
+    reach = shared_m3 > _SHARED_M3
+    if not reach and hidden_m2 <= _HIDDEN_M2:
+        return mesh, False
     made: Any = joined.to_mesh()
     cavities = mesh.faces[~solid[piece]]
     vertices = np.concatenate([np.asarray(made.vert_properties, np.float64)[:, :3], mesh.vertices])
@@ -55,7 +97,7 @@ def as_one(mesh: TriangleMesh, *, touching: bool = False) -> TriangleMesh:
     # Where edges of both meet, faces without area join corners at one place.
     faces = faces[has_three_corners(faces)]
     # Those that touch along an edge share it now.
-    return apart(TriangleMesh(vertices, np.ascontiguousarray(faces, dtype=np.int32)))
+    return apart(TriangleMesh(vertices, np.ascontiguousarray(faces, dtype=np.int32))), reach
 
 
 def apart(mesh: TriangleMesh) -> TriangleMesh:
@@ -119,7 +161,7 @@ def _boxes(mesh: TriangleMesh, piece: NDArray[np.int64]) -> tuple[Array, Array]:
 
 
 def _may_meet(low: Array, high: Array, solid: NDArray[np.bool_]) -> bool:
-    low, high = low[solid] + _APART_M, high[solid]
+    low, high = low[solid] - _APART_M, high[solid]
     return any(
         bool(((low[i] < high[i + 1 :]) & (low[i + 1 :] < high[i])).all(axis=1).any()) for i in range(len(low) - 1)
     )
