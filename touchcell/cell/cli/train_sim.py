@@ -229,7 +229,7 @@ def _discs(imagined: Imagined, samples: int, seed: int, *, matched: bool) -> Lab
     middle, known = Tip(imagined.tip), None
     reference = middle.project(middle.rest_positions) - corner
     if imagined.of_shapes:
-        # Half a million contacts, of which float64 would take twice as much.
+        # Of hundreds of thousands of contacts float64 would take gigabytes more.
         moved = np.empty((samples, len(reference), 2), np.float32)
         known = KnownMarkers(reference, moved, np.empty((samples, len(reference)), np.bool_))
     for i, contact in enumerate(imagined.contacts(samples, seed)):
