@@ -35,9 +35,9 @@ _AXES: Final = {
 
 _BEND_SHARE: Final = 0.4
 """Of the largest turn that a bend may take, so that corrections have the rest."""
-_HALF_SPEED_RAD: Final = math.radians(2.0)
+_HALF_SPEED_RAD: Final = math.radians(2.5)
 """The tilt at which the speed is halved. Estimates of an edge scatter more than those of a surface."""
-_TILT_WINDOW: Final = 1.2
+_TILT_WINDOW: Final = 1.6
 """Over which the bend of the face is felt, as a multiple of that of the edge."""
 _NO_EDGE_S: Final = 0.1
 """Without an edge before anything is followed: three frames, before the controller goes where it seems to be."""
