@@ -154,3 +154,15 @@ def test_output_and_integral_never_leave_their_clips(kp, ki, kd, integral_limit,
         out = pid.step(e, V_ff, dt_s)
         assert (np.abs(out) <= output_limit).all()
         assert (np.abs(pid.integral) <= integral_limit).all()
+
+
+def test_an_error_outside_the_zone_unwinds_an_integral_of_the_other_sign_to_zero_at_most():
+    pid = Pid(gains(ki=1.0, integral_zone=np.full(6, 0.5)))
+    for _ in range(10):
+        pid.step(np.full(6, -0.5), ZERO, 0.1)
+    assert pid.integral == pytest.approx(np.full(6, -0.5))
+    pid.step(np.full(6, 2.0), ZERO, 0.1)
+    assert pid.integral == pytest.approx(np.full(6, -0.3))
+    for _ in range(5):
+        pid.step(np.full(6, 2.0), ZERO, 0.1)
+    assert pid.integral == pytest.approx(np.zeros(6))

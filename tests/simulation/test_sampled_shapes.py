@@ -10,11 +10,13 @@ from touchcell.simulation.contact import ContactLaw
 from touchcell.simulation.edge_samples import EdgeRanges, edge_contacts, frame_on_rim
 from touchcell.simulation.edge_ways import contacts_on_way
 from touchcell.simulation.meshes.mesh_shape import MeshShape
+from touchcell.simulation.meshes.smoothing import TriangleMesh
+from touchcell.simulation.pressed import felt_when_pressed
 from touchcell.simulation.random_parts import random_part, steep_part
 from touchcell.simulation.samples import SampledContact, Variation
 from touchcell.simulation.shape_samples import shape_contacts
 from touchcell.simulation.surfaces import Surface
-from touchcell.simulation.tip import Tip
+from touchcell.simulation.tip import Tip, mirrored
 
 STILL = Variation(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
@@ -94,6 +96,38 @@ def test_no_contact_is_drawn_at_the_border_of_a_part_that_is_open_below() -> Non
 def test_a_longer_draw_begins_with_the_shorter_one() -> None:
     one, two = list(edge_contacts(40, 3, part=steep_part)), list(edge_contacts(72, 3, part=steep_part))
     assert all(np.array_equal(a.pixels, b.pixels) for a, b in zip(one, two[:40], strict=True))
+
+
+def test_every_other_contact_is_the_one_before_it_in_a_mirror() -> None:
+    found = contacts_mm_deg(list(edge_contacts(8, 3, variation=STILL)))
+    np.testing.assert_allclose(found[1::2, [0, 2, 4]], found[::2, [0, 2, 4]], atol=1e-9)
+    np.testing.assert_allclose(found[1::2, [3, 5]], -found[::2, [3, 5]], atol=1e-9)
+    assert np.abs(found[:, 5]).max() > 1.0
+
+
+def test_a_mirrored_part_gives_the_mirrored_contact() -> None:
+    rng, law, tip = np.random.default_rng(3), ContactLaw(), Tip()
+    mesh = steep_part(rng)
+    assert mesh.normals is not None
+    over = np.array([1.0, -1.0, 1.0])
+    # The corners of a face go the other way round, so that it still faces outwards.
+    faces, normals = np.ascontiguousarray(mesh.faces[:, ::-1]), np.ascontiguousarray((mesh.normals * over)[:, ::-1])
+    shape = MeshShape(mesh, math.radians(30.0))
+    one, other = (
+        Surface(shape),
+        Surface(MeshShape(TriangleMesh(mesh.vertices * over, faces, normals), math.radians(30.0))),
+    )
+    T_world_e = frame_on_rim(shape, one, law.tip_radius_m, rng)
+    T_start = se3.compose(T_world_e, se3.from_euler_mm_deg([-0.5, 2.0, 3.0, 4.0, -5.0, 8.0]))
+    T_world_s = se3.compose(T_world_e, se3.from_euler_mm_deg([0.5, 0.0, 3.0, 4.0, -5.0, 12.0]))
+    _, felt = felt_when_pressed(one, tip, law, T_start, T_world_s)
+    _, expected = felt_when_pressed(other, tip, law, mirrored(T_start), mirrored(T_world_s))
+    found = felt.mirrored()
+    np.testing.assert_allclose(found.T_f_s, expected.T_f_s, atol=1e-12)
+    assert found.relief is not None
+    assert expected.relief is not None
+    assert np.abs(found.relief).max() > 1e-4
+    np.testing.assert_allclose(found.relief, expected.relief, atol=1e-12)
 
 
 def test_contacts_on_ways_are_held_as_a_controller_holds_them_and_turn_far_at_corners() -> None:

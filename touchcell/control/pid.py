@@ -27,7 +27,7 @@ class PidGains:
         kd: derivative gain, likewise, dimensionless.
         integral_limit: largest magnitude (6,) of each component of the integral term ``ki @ int(e)``, m/s and rad/s.
         integral_zone: an error component (6,) larger than this is not integrated, m and rad (anti-windup): after a step
-            of the reference the integral would only cause overshoot.
+            of the reference the integral would only cause overshoot. It unwinds an integral of the other sign.
         output_limit: largest magnitude (6,) of each component of the output, feedforward included, m/s and rad/s.
 
     Raises:
@@ -62,7 +62,8 @@ class Pid:
 
     The error is smoothed by an exponentially weighted average before it is differentiated. The integral *term* is
     accumulated and clipped, in m/s and rad/s: with constant gains that equals the paper's clipped integral. Errors
-    outside the integral zone are not integrated, nor is what would drive a clipped output farther beyond its limit.
+    outside the integral zone can only unwind the integral; what would drive a clipped output farther beyond its limit
+    is not integrated.
     After ``reset`` the first step has no derivative and no history, so it starts without a kick.
     """
 
@@ -103,8 +104,13 @@ class Pid:
         before = e if self._smoothed is None else self._smoothed
         with np.errstate(over="ignore", invalid="ignore"):
             smoothed = SMOOTHING * e + (1.0 - SMOOTHING) * before
-            near = e * (np.abs(e) <= gains.integral_zone)
-            integral = _clipped(self._integral + gains.ki @ near * dt_s, gains.integral_limit)
+            near = np.abs(e) <= gains.integral_zone
+            step = gains.ki @ (e * near) * dt_s
+            if not near.all():
+                # Otherwise a wound-up integral would balance a constant error outside the zone for good.
+                far = gains.ki @ (e * ~near) * dt_s
+                step = step + np.where(far * self._integral < 0.0, _clipped(far, np.abs(self._integral)), 0.0)
+            integral = _clipped(self._integral + step, gains.integral_limit)
             rest = V_ff + gains.kp @ e
             if self._differentiates:
                 rest = rest + gains.kd @ ((smoothed - before) / dt_s)

@@ -24,13 +24,13 @@ from touchcell.simulation.edge_ways import contacts_on_way
 from touchcell.simulation.edges import nearest_edge
 from touchcell.simulation.meshes.mesh_shape import MeshShape
 from touchcell.simulation.meshes.smoothing import TriangleMesh
-from touchcell.simulation.pressed import pressed
+from touchcell.simulation.pressed import felt_when_pressed
 from touchcell.simulation.random_parts import random_part
 from touchcell.simulation.samples import SampledContact, Variation, scattered
 from touchcell.simulation.surfaces import Surface
-from touchcell.simulation.tip import Tip, TipParameters
+from touchcell.simulation.tip import SkinContact, Tip, TipParameters, mirrored
 
-_IMAGES_PER_TIP: Final = 32
+_IMAGES_PER_TIP: Final = 64
 _CREASE_RAD: Final = math.radians(30.0)
 _SPREADS: Final = np.array([0.0, 0.2, 0.07])
 """Of the ranges, by which a third of the contacts each is scattered about the middle; zero for evenly."""
@@ -107,40 +107,60 @@ def edge_contacts(
     variation: Variation | None = None,
     part: Callable[[np.random.Generator], TriangleMesh] = random_part,
 ) -> Iterator[SampledContact]:
-    """Yield ``n`` random contacts with edges, the same for the same seed; ``part`` draws what is touched."""
+    """Yield ``n`` random contacts with edges, the same for the same seed; ``part`` draws what is touched.
+
+    Every other one is its predecessor in a mirror, seen by the same tip: what a mirrored part would give is as likely,
+    and costs a tenth. The markers are another set of numbers, as the lattice is no mirror image of itself.
+    """
     ranges, variation, law = ranges or EdgeRanges(), variation or Variation(), ContactLaw()
     for start in range(0, n, _IMAGES_PER_TIP):
         # Of its own for each part: a longer draw begins with the shorter one.
         rng = np.random.default_rng([seed, start])
         tip = Tip(scattered(TipParameters(), variation, rng))
-        shape = MeshShape(part(rng), _CREASE_RAD)
+        shape = shape_with_rim(part, rng)
         made = _on_ways if rng.random() < _ON_WAYS else _anywhere
-        for T_e_s, pixels in islice(made(shape, tip, ranges, law, rng), min(_IMAGES_PER_TIP, n - start)):
-            pixels = pixels + rng.normal(0.0, variation.marker_px, pixels.shape)
+        both = _and_mirrored(made(shape, tip, ranges, law, rng))
+        for T_e_s, felt in islice(both, min(_IMAGES_PER_TIP, n - start)):
+            pixels = tip.pixels(felt.T_f_s, felt.relief)
+            pixels += rng.normal(0.0, variation.marker_px, pixels.shape)
             seen = rng.random(len(pixels)) >= variation.missing
             radius = tip.parameters.disc_radius_px * (1.0 + rng.normal(0.0, variation.disc_radius))
             yield SampledContact(T_e_s, pixels, seen, float(radius))
 
 
+def shape_with_rim(part: Callable[[np.random.Generator], TriangleMesh], rng: np.random.Generator) -> MeshShape:
+    """Return a drawn part with a rim: of one that is nearly flat at its edge the next is drawn in its place."""
+    while True:
+        shape = MeshShape(part(rng), _CREASE_RAD)
+        if len(_corners(shape)[0]):
+            return shape
+
+
+def _and_mirrored(drawn: Iterator[tuple[Array, SkinContact]]) -> Iterator[tuple[Array, SkinContact]]:
+    for T_e_s, felt in drawn:
+        yield T_e_s, felt
+        yield mirrored(T_e_s), felt.mirrored()
+
+
 def _on_ways(
     shape: MeshShape, tip: Tip, ranges: EdgeRanges, law: ContactLaw, rng: np.random.Generator
-) -> Iterator[tuple[Array, Array]]:
-    """Yield T_e_s (4, 4) and pixels (markers, 2) of contacts within the ranges, on ways along the rim."""
+) -> Iterator[tuple[Array, SkinContact]]:
+    """Yield T_e_s (4, 4) and what the skin feels, of contacts within the ranges, on ways along the rim."""
     surface = Surface(shape)
     while True:
         T_world_e = frame_on_rim(
             shape, surface, law.tip_radius_m, rng, at_corners=_BEFORE_CORNER, beside_corner_m=_BEFORE_M
         )
-        for label, pixels in contacts_on_way(surface, tip, law, T_world_e, rng, _WAY_FRAMES):
+        for label, felt in contacts_on_way(surface, tip, law, T_world_e, rng, _WAY_FRAMES):
             if not ranges.holds(label):
                 break
-            yield _labelled(label, rng), pixels
+            yield _labelled(label, rng), felt
 
 
 def _anywhere(
     shape: MeshShape, tip: Tip, ranges: EdgeRanges, law: ContactLaw, rng: np.random.Generator
-) -> Iterator[tuple[Array, Array]]:
-    """Yield T_e_s (4, 4) and pixels (markers, 2) of contacts within the ranges, each by itself."""
+) -> Iterator[tuple[Array, SkinContact]]:
+    """Yield T_e_s (4, 4) and what the skin feels, of contacts within the ranges, each by itself."""
     surface, radius_m = Surface(shape), law.tip_radius_m
     while True:
         past = _past_corner(shape, surface, radius_m, rng) if rng.random() < _PAST_CORNER else None
@@ -150,15 +170,16 @@ def _anywhere(
         else:
             T_world_e, T_world_s = past
         # Beside corners and on bends the edge that the tip feels is not the one that it was placed at.
-        felt = nearest_edge([surface], T_world_s, 0.0, radius_m)
-        assert felt is not None
-        label = se3.to_euler_mm_deg(se3.compose(se3.inverse(felt), T_world_s))
+        nearest = nearest_edge([surface], T_world_s, 0.0, radius_m)
+        assert nearest is not None
+        label = se3.to_euler_mm_deg(se3.compose(se3.inverse(nearest), T_world_s))
         if not ranges.holds(label):
             continue
-        state, pixels = pressed(surface, tip, law, dragged_to(T_world_e, T_world_s, ranges, rng), T_world_s)
+        T_start = dragged_to(T_world_e, T_world_s, ranges, rng)
+        state, felt = felt_when_pressed(surface, tip, law, T_start, T_world_s)
         if not state.in_contact:
             continue
-        yield _labelled(label, rng), pixels
+        yield _labelled(label, rng), felt
 
 
 def _labelled(label_mm_deg: Array, rng: np.random.Generator) -> Array:

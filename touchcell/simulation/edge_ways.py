@@ -19,7 +19,7 @@ from touchcell.simulation.contact import ContactLaw, ContactModel
 from touchcell.simulation.edges import nearest_edge
 from touchcell.simulation.relief import felt_relief
 from touchcell.simulation.surfaces import Surface
-from touchcell.simulation.tip import Tip
+from touchcell.simulation.tip import SkinContact, Tip
 
 _FRAME_S: Final = 1.0 / 30.0
 _LATE: Final = 1
@@ -50,8 +50,8 @@ _UNTILTED: Final = 0.15
 
 def contacts_on_way(
     surface: Surface, tip: Tip, law: ContactLaw, T_world_e: Array, rng: np.random.Generator, frames: int
-) -> Iterator[tuple[Array, Array]]:
-    """Yield label (6,) mm and deg, and pixels (markers, 2), of contacts on a way that begins at ``T_world_e``.
+) -> Iterator[tuple[Array, SkinContact]]:
+    """Yield label (6,) mm and deg, and what the skin feels, of contacts on a way that begins at ``T_world_e``.
 
     It takes ``frames``, and ends early where contact or edge is lost. The label is the sensor's pose in the frame {e}
     nearest to it.
@@ -73,7 +73,7 @@ def contacts_on_way(
         label = se3.to_euler_mm_deg(se3.compose(se3.inverse(T_edge), T_world_s))
         if i >= _SETTLED and (i - _SETTLED) % _EVERY == 0:
             relief = felt_relief(surface, T_world_s, 0.0, tip.relief.directions, radius_m)
-            yield label, tip.pixels(state.T_f_s, relief)
+            yield label, SkinContact(state.T_f_s, relief)
         error = _ERROR_KEPT * error + math.sqrt(1.0 - _ERROR_KEPT**2) * rng.normal(0.0, spread)
         seen.append(label + error)
         believed = seen[max(len(seen) - 1 - _LATE, 0)]

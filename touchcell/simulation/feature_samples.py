@@ -17,7 +17,7 @@ from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 from touchcell.perception.features.feature_model import CLASSES
 from touchcell.simulation.contact import ContactLaw
-from touchcell.simulation.edge_samples import EdgeRanges, dragged_to, frame_on_rim
+from touchcell.simulation.edge_samples import EdgeRanges, dragged_to, frame_on_rim, shape_with_rim
 from touchcell.simulation.edges import nearest_edge
 from touchcell.simulation.meshes.mesh_shape import MeshShape
 from touchcell.simulation.pressed import pressed
@@ -28,7 +28,6 @@ from touchcell.simulation.surfaces import Surface
 from touchcell.simulation.tip import Tip, TipParameters
 
 _CONTACTS_PER_TIP: Final = 32
-_CREASE_RAD: Final = math.radians(30.0)
 _STEEP: Final = 0.3
 _ON_EDGE_M: Final = 4e-3
 _AT_CORNER_M: Final = 4e-3
@@ -46,7 +45,7 @@ def feature_contacts(n: int, seed: int, *, variation: Variation | None = None) -
     variation, law = variation or Variation(), ContactLaw()
     for start in range(0, n, _CONTACTS_PER_TIP):
         tip = Tip(scattered(TipParameters(), variation, rng))
-        part = MeshShape((steep_part if rng.random() < _STEEP else random_part)(rng), _CREASE_RAD)
+        part = shape_with_rim(steep_part if rng.random() < _STEEP else random_part, rng)
         surface, corners = Surface(part), _corners(part)
         smooth = random_curved_surface(rng)
         for _ in range(min(_CONTACTS_PER_TIP, n - start)):

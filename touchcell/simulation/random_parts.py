@@ -21,6 +21,9 @@ _BLUNTEST_RAD: Final = math.radians(50.0)
 _SHARPEST_RAD: Final = math.radians(40.0)
 _DOWN_M: Final = (3e-3, 7e-3, 12e-3, 18e-3, _WALL_M)
 _WALL_PER_M: Final = 45.0
+_PLAIN: Final = 0.2
+_STEEP_BLUNTEST_RAD: Final = math.radians(60.0)
+_STEEP_WALL_PER_M: Final = 60.0
 _NARROWEST: Final = 0.15
 """Size of a part's foot, as a share of its face, about."""
 _SHEETS: Final = 0.25
@@ -36,7 +39,7 @@ _STEEP_FLAT: Final = 0.3
 _STEEP_BENT: Final = 0.6
 _STEEP_CURVATURE_PER_M: Final = (6.0, 36.0)
 _STEEP_WAVES_PER_M: Final = (70.0, 135.0)
-_STEEP_SHARE: Final = (1.0, 2.3)
+_STEEP_SHARE: Final = (1.0, 2.8)
 _SHARPEST_CURVATURE_PER_M: Final = 36.0
 _STEEPEST_WAVE: Final = 0.35
 _WAVES_PER_M: Final = (45.0, 130.0)
@@ -49,7 +52,8 @@ def steep_part(rng: np.random.Generator) -> TriangleMesh:
     """
     hole = bool(rng.random() < _STEEP_HOLES)
     outline = _outline(rng, hole=hole, kind=rng.uniform(0.12, 0.6))
-    lean, wall_per_m = rng.uniform(-_BLUNTEST_RAD, _SHARPEST_RAD), rng.uniform(-_WALL_PER_M, _WALL_PER_M)
+    lean = rng.uniform(-_STEEP_BLUNTEST_RAD, _SHARPEST_RAD)
+    wall_per_m = rng.uniform(-_STEEP_WALL_PER_M, _STEEP_WALL_PER_M)
     sheet_m = rng.uniform(*_SHEET_M) if rng.random() < _SHEETS else None
     middle = outline[rng.integers(len(outline))]
     return _part(outline, middle, _steep_heights(rng), lean, wall_per_m, sheet_m, None, hole=hole, exact=True)
@@ -65,13 +69,15 @@ def _steep_heights(rng: np.random.Generator) -> Callable[[Array], Array]:
     # Two alike across each other, as in an egg box.
     per_m = rng.uniform(*_STEEP_WAVES_PER_M)
     across = np.array([turns[0], turns[0] + 0.5 * math.pi])
-    return _waves(across, np.full(2, per_m), rng.uniform(*_STEEP_SHARE, 2), rng.uniform(0.0, 2.0 * math.pi, 2))
+    share = np.full(2, rng.uniform(*_STEEP_SHARE)) * rng.uniform(0.8, 1.0, 2)
+    return _waves(across, np.full(2, per_m), share, rng.uniform(0.0, 2.0 * math.pi, 2))
 
 
 def random_part(rng: np.random.Generator) -> TriangleMesh:
     """Return a part whose rim is an edge between a face above and a wall below; its face looks towards +z.
 
-    A quarter of the faces are flat, the others bend both ways or are waves, with radii down to 28 mm, so that rims lead
+    One in five is as most that are made: a flat face and upright walls. Of the rest
+    a quarter of the faces are flat, the others bend both ways or are waves, with radii down to 28 mm, so that rims lead
     through space. Three quarters of the walls lean, so that they meet a face at 50 to 140 deg, and most of these bend,
     as a bowl's do. Outlines are circles, waves round a circle, drops with one sharp end, polygons and stars; three in
     ten are the rims of holes. A quarter are sheets 3 to 8 mm thick, a tenth are rings no wider than 12 mm, like the
@@ -79,6 +85,8 @@ def random_part(rng: np.random.Generator) -> TriangleMesh:
     """
     hole = bool(rng.random() < _HOLES)
     outline = _outline(rng, hole=hole, kind=rng.random())
+    if rng.random() < _PLAIN:
+        return _part(outline, outline[0], _flat, 0.0, 0.0, None, None, hole=hole)
     heights = _random_heights(rng)
     # Walls that lean under the face are as sharp as those of thin plates; blunt ones are those of bowls.
     lean = rng.uniform(-_BLUNTEST_RAD, _SHARPEST_RAD) * (rng.random() < _LEANING)

@@ -12,6 +12,7 @@ import math
 from typing import Final, Protocol, runtime_checkable
 
 import numpy as np
+from numpy.typing import NDArray
 
 from touchcell.geometry.surface_point import SurfacePoint
 from touchcell.geometry.types import Array
@@ -83,6 +84,12 @@ class ReliefKernel:
         """Return (..., markers, 3) their gradient along the sphere, per radian."""
         slopes: Array = np.einsum("mck,...k->...mc", self._slopes, felt)
         return slopes
+
+
+def mirrored_samples() -> NDArray[np.int64]:
+    """Return which sample is the image of each in a mirror at the sensor's xz plane."""
+    counts = [max(6 * k, 1) for k in range(_RINGS + 1)]
+    return np.concatenate([sum(counts[:k]) + (-np.arange(count)) % count for k, count in enumerate(counts)])
 
 
 def felt_relief(surface: Surface, T_world_s: Array, t_s: float, directions: Array, tip_radius_m: float) -> Array | None:

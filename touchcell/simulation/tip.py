@@ -13,12 +13,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from touchcell.geometry.types import Array
-from touchcell.simulation.relief import ReliefKernel
+from touchcell.simulation.relief import ReliefKernel, mirrored_samples
 
 _MM = 1e-3
 _DEG = math.pi / 180.0
 _MIDDLING_DEPTH_M = 3.0 * _MM
 _ROOT_MM = math.sqrt(_MM)
+_MIRROR = np.array([1.0, -1.0, 1.0, 1.0])
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,6 +96,30 @@ class TipParameters:
     bulge_width_rad: float = 69.0 * _DEG
     rock: float = -0.77
     pin_lever_m: float = 0.89 * _MM
+
+
+@dataclass(frozen=True, slots=True)
+class SkinContact:
+    """What the skin of any tip feels in a contact.
+
+    Attributes:
+        T_f_s: (4, 4) contact pose after slip.
+        relief: (samples,) m, as ``Tip.marker_positions``; None on a plane.
+    """
+
+    T_f_s: Array
+    relief: Array | None
+
+    def mirrored(self) -> SkinContact:
+        """Return the contact with a part and a way that are this one's in a mirror at the sensor's xz plane."""
+        relief = None if self.relief is None else self.relief[mirrored_samples()]
+        return SkinContact(mirrored(self.T_f_s), relief)
+
+
+def mirrored(T: Array) -> Array:
+    """Return pose ``T`` (4, 4) in a mirror at the xz planes of both frames."""
+    image: Array = _MIRROR * T * _MIRROR[:, None]
+    return image
 
 
 class Tip:

@@ -33,10 +33,12 @@ _AXES: Final = {
 """Components of the sensor's twist that a task of so many dimensions commands."""
 
 
-_BEND_SHARE: Final = 0.6
+_BEND_SHARE: Final = 0.4
 """Of the largest turn that a bend may take, so that corrections have the rest."""
 _HALF_SPEED_RAD: Final = math.radians(2.5)
 """The tilt at which the speed is halved. Estimates of an edge scatter more than those of a surface."""
+_TILT_WINDOW: Final = 1.6
+"""Over which the bend of the face is felt, as a multiple of that of the edge."""
 _NO_EDGE_S: Final = 0.1
 """Without an edge before anything is followed: three frames, before the controller goes where it seems to be."""
 _STILL_RAD: Final = math.radians(45.0)
@@ -66,8 +68,9 @@ class EdgeFollowingConfig(ServoConfig):
     offset_mm: float = Field(default=0.0, ge=-10.0, le=10.0)
     dimensions: Literal[2, 3, 5] = 5
     direction: Literal["forward", "backward"] = "forward"
-    kp_per_s: SixGains = (8.0, 0.0, 8.0, 8.0, 8.0, 8.0)
-    ki_per_s2: SixGains = (16.0, 0.0, 16.0, 16.0, 16.0, 16.0)
+    # Past a corner a turn has to be made within a third of a second; an integral across the edge overshoots there.
+    kp_per_s: SixGains = (8.0, 0.0, 8.0, 8.0, 8.0, 11.0)
+    ki_per_s2: SixGains = (6.0, 0.0, 16.0, 16.0, 16.0, 16.0)
     max_turn_deg_s: PositiveFloat = 180.0
     max_integral_turn_deg_s: PositiveFloat = 60.0
     max_accel_mm_s2: PositiveFloat = 550.0
@@ -108,7 +111,8 @@ class FollowEdge:
         self._speed_m_s = 1e-3 * config.speed_mm_s
         self._feedforward = np.zeros(6)
         self._turn_bend = CurvatureEstimator(1e-3 * config.bend_window_mm)
-        self._tilt_bend = CurvatureEstimator(2e-3 * config.bend_window_mm)
+        # A longer one is late where a face bends to and fro, as a wave does within 30 mm.
+        self._tilt_bend = CurvatureEstimator(_TILT_WINDOW * 1e-3 * config.bend_window_mm)
         self._fastest_rad_s = math.radians(config.max_turn_deg_s)
         self._tilts = config.dimensions == 5
         self._distance_m = 1e-3 * config.distance_mm

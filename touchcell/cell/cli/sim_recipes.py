@@ -46,7 +46,7 @@ class SimRecipe:
 
 
 PRESETS: Final = {
-    "sim_edge": SimRecipe(samples=192_000, kind="markers", epochs=10, feature="edge"),
+    "sim_edge": SimRecipe(samples=172_000, kind="markers", epochs=16, feature="edge"),
     "sim_kinds": SimRecipe(samples=20_000, epochs=20, feature="kinds"),
     "sim_shape": SimRecipe(samples=40_000, kind="markers", epochs=20, feels="shape"),
     # Objects that need force press in by 7 mm before an interlock stops the arm.

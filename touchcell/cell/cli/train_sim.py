@@ -82,7 +82,16 @@ DETAIL_SETTINGS: Final[dict[str, Any]] = {
 
 _SPREAD_PARAMETERS: Final = 0.02
 """Relative standard deviation of a tip's parameters about one that is drawn between those that are known."""
-_STEEP: Final = 0.25
+_NOISELESS: Final = replace(USUAL_VARIATION, marker_px=0.0)
+_EDGE_SETTINGS: Final[dict[str, Any]] = {
+    "hidden": (512, 640, 384),
+    "marker_px": 0.07,
+    "details": 160,
+    "details_px": 0.07,
+}
+"""The noise is that of discs which were drawn and found again."""
+
+_STEEP: Final = 0.4
 """Of the contacts with edges, on parts of what is rare among random ones."""
 _STEEP_SEED: Final = 500_000
 _OTHER_SEED: Final = 1_000_000
@@ -136,8 +145,8 @@ class Imagined:
         """Random ones."""
         if self.feature == "edge":
             steep = round(_STEEP * samples)
-            usual = edge_contacts(samples - steep, seed, variation=USUAL_VARIATION)
-            return chain(usual, edge_contacts(steep, seed + _STEEP_SEED, variation=USUAL_VARIATION, part=steep_part))
+            usual = edge_contacts(samples - steep, seed, variation=_NOISELESS)
+            return chain(usual, edge_contacts(steep, seed + _STEEP_SEED, variation=_NOISELESS, part=steep_part))
         depth_mm, variation, tips = (0.0, self.deepest_mm), USUAL_VARIATION, None
         if self.tips == "spread":
             variation, tips = replace(variation, parameters=_SPREAD_PARAMETERS), TipSpread().draw
@@ -194,11 +203,12 @@ def _train_markers(
     settings = MarkerSettings(seed=seed)
     if imagined.of_shapes:
         # One network in a file of 5 MB, which can ship. Its sensors scatter already, by what a camera is remounted.
-        hidden = (512, 512, 256) if imagined.feature == "edge" else (384, 384, 256)
-        settings = replace(settings, hidden=hidden, networks=1, **DETAIL_SETTINGS)
+        settings = replace(settings, hidden=(384, 384, 256), networks=1, **DETAIL_SETTINGS)
+    if imagined.feature == "edge":
+        settings = replace(settings, **_EDGE_SETTINGS)
     train_on_discs(
-        _discs(imagined, samples, seed),
-        _discs(imagined, _for_validation(samples), seed + _OTHER_SEED),
+        _discs(imagined, samples, seed, matched=False),
+        _discs(imagined, _for_validation(samples), seed + _OTHER_SEED, matched=True),
         out,
         preprocessing=imagined.preprocessing("markers"),
         size=MarkerSize.of_disc(np.pi * imagined.tip.disc_radius_px**2),
@@ -208,28 +218,30 @@ def _train_markers(
     )
 
 
-def _discs(imagined: Imagined, samples: int, seed: int) -> LabelledDiscs:
-    """Discs of simulated frames, without the frames."""
+def _discs(imagined: Imagined, samples: int, seed: int, *, matched: bool) -> LabelledDiscs:
+    """Discs of simulated frames, without the frames; known markers alone where they need not be ``matched`` either."""
     from touchcell.perception.networks.marker_learning import KnownMarkers
     from touchcell.perception.networks.marker_training import LabelledDiscs
 
     height, width = PUBLIC_SIZE
     corner = np.array(PUBLIC_CROP[:2], dtype=np.float64)
-    frames, labels, places, seen = [], [], [], []
-    for contact in imagined.contacts(samples, seed):
+    frames, labels = [], np.empty((samples, 4, 4))
+    middle, known = Tip(imagined.tip), None
+    reference = middle.project(middle.rest_positions) - corner
+    if imagined.of_shapes:
+        # Of hundreds of thousands of contacts float64 would take gigabytes more.
+        moved = np.empty((samples, len(reference), 2), np.float32)
+        known = KnownMarkers(reference, moved, np.empty((samples, len(reference)), np.bool_))
+    for i, contact in enumerate(imagined.contacts(samples, seed)):
         centres = contact.markers - corner
         reach = contact.disc_radius_px
         whole = ((centres >= reach) & (centres <= np.array([width, height]) - 1.0 - reach)).all(axis=1) & contact.seen
-        frames.append(Discs(centres[whole], np.full(int(whole.sum()), np.pi * reach**2)))
-        labels.append(contact.T_f_s)
-        places.append(centres)
-        seen.append(whole)
-    known = None
-    if imagined.of_shapes:
-        middle = Tip(imagined.tip)
-        reference = middle.project(middle.rest_positions) - corner
-        known = KnownMarkers(reference, np.stack(places) - reference, np.stack(seen))
-    return LabelledDiscs(frames, se3.log(se3.inverse(np.stack(labels))), known)
+        labels[i] = contact.T_f_s
+        if known is not None:
+            known.displacements[i], known.seen[i] = centres - reference, whole
+        if known is None or matched:
+            frames.append(Discs(centres[whole], np.full(int(whole.sum()), np.pi * reach**2)))
+    return LabelledDiscs(frames, se3.log(se3.inverse(labels)), known)
 
 
 def draw(samples: int, seed: int, split: str, observer: Observer, imagined: Imagined | None = None) -> LabelledImages:

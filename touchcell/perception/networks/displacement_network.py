@@ -17,7 +17,6 @@ from touchcell.perception.networks.contact_network import Alignment
 
 _DISPLACEMENT_PX = 8.0
 _NARROWEST = 0.02
-_MOST_FOR_DETAILS = 8000
 
 
 class DisplacementNetwork(nn.Module):
@@ -106,8 +105,8 @@ def details_of(displacements: Array, count: int, smallest_px: float) -> Array:
         smallest_px: components that vary by less are scaled as if they varied by this.
     """
     centred = displacements - displacements.mean(axis=0)
-    _, singular, basis = np.linalg.svd(centred[:_MOST_FOR_DETAILS], full_matrices=False)
-    spread = singular[:count] / math.sqrt(min(len(centred), _MOST_FOR_DETAILS))
+    _, singular, basis = np.linalg.svd(centred, full_matrices=False)
+    spread = singular[:count] / math.sqrt(len(centred))
     rows: Array = basis[:count] / np.maximum(spread, smallest_px)[:, None]
     return rows
 
@@ -118,11 +117,12 @@ class Jitter:
     Args:
         reference: (m, 2) px, the markers at rest.
         shift_px, turn_rad, zoom: standard deviations.
+        marker_px: of each marker by itself.
     """
 
-    def __init__(self, reference: Array, shift_px: float, turn_rad: float, zoom: float) -> None:
+    def __init__(self, reference: Array, shift_px: float, turn_rad: float, zoom: float, marker_px: float = 0.0) -> None:
         self._around_middle = torch.from_numpy((reference - reference.mean(axis=0)).astype(np.float32))
-        self._shift_px, self._turn_rad, self._zoom = shift_px, turn_rad, zoom
+        self._shift_px, self._turn_rad, self._zoom, self._marker_px = shift_px, turn_rad, zoom, marker_px
 
     def __call__(self, displacements: Tensor) -> Tensor:
         """Return displacements (networks, n, 2 m) px, each with another random camera change."""
@@ -132,6 +132,8 @@ class Jitter:
         moved = self._shift_px * torch.randn(networks, n, 1, 2)
         moved = moved + self._turn_rad * torch.randn(networks, n, 1, 1) * across
         moved = moved + self._zoom * torch.randn(networks, n, 1, 1) * place
+        if self._marker_px:
+            moved = moved + self._marker_px * torch.randn_like(moved)
         return displacements + moved.flatten(2)
 
 

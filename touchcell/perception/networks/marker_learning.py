@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final, Protocol, runtime_checkable
+from typing import Any, Final, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +35,7 @@ GUESS_HIDDEN = 256
 _GUESS_BATCH = 128
 _CANDIDATES = 60
 _BANK = 2000
+_MOST_FOR_MATCHING = 40_000
 _LAST_STEPS = 100
 _SURE = 0.96
 _SPREADS = 2
@@ -72,7 +73,7 @@ class KnownMarkers:
     """
 
     reference: Array
-    displacements: Array
+    displacements: NDArray[np.floating[Any]]
     seen: NDArray[np.bool_]
 
 
@@ -88,13 +89,20 @@ def learned_of_known(
         guess_steps: of the training of the first guess.
         seed: of everything random.
     """
-    model = DisplacementModel.fit(markers.reference, markers.displacements, np.ones_like(markers.seen), modes)
-    coefficients = (markers.displacements.reshape(len(markers.seen), -1) - model.mean) @ model.basis.T
-    guess = train_guess(model, coefficients, markers.seen, noise_px=0.5, scatter=0.05, steps=guess_steps, seed=seed)
+    some = spread(np.arange(len(markers.seen)), _MOST_FOR_MATCHING)
+    displacements, seen = markers.displacements[some].astype(np.float64), markers.seen[some]
+    model = DisplacementModel.fit(markers.reference, displacements, np.ones_like(seen), modes)
+    coefficients = (displacements.reshape(len(seen), -1) - model.mean) @ model.basis.T
+    guess = train_guess(model, coefficients, seen, noise_px=0.5, scatter=0.05, steps=guess_steps, seed=seed)
     least_score, most_rms_px = 0.9, 0.2 * model.spacing_px
     bank = _bank(coefficients)
     matcher = MarkerMatcher(model, guess, image_size, bank=bank, least_score=least_score, most_rms_px=most_rms_px)
     return Learned(matcher, guess, bank, least_score, most_rms_px, [])
+
+
+def spread(indices: NDArray[np.int64], most: int) -> NDArray[np.int64]:
+    """Return ``most`` of the indices at most, evenly from among them: contacts of one kind come one after the other."""
+    return indices[:: -(-len(indices) // most)]
 
 
 def find_rings(frames: Sequence[Discs]) -> int:

@@ -59,6 +59,7 @@ from touchcell.perception.networks.marker_learning import (
     learn_markers,
     learned_of_known,
     match_all,
+    spread,
     stacked,
 )
 from touchcell.perception.networks.progress import Display, Observer
@@ -66,6 +67,8 @@ from touchcell.perception.networks.progress import Display, Observer
 _LEAST_SCORE_TAUGHT = 0.9
 _LEAST_BATCHES = 16
 _LOOKED_AT = 20
+_MOST_FOR_CHECK = 40_000
+_MOST_FOR_DETAILS = 8000
 _MATCHING = 2  # Version of the matching, so that results of older versions are not taken from the cache.
 
 
@@ -87,6 +90,7 @@ class MarkerSettings:
         memory: decay of the running average of the networks: the fraction that is kept per step.
         noise: standard deviation added to scaled inputs.
         shift_px, turn_rad, zoom: standard deviations of the jitter, as of a camera that was remounted.
+        marker_px: standard deviation added to each marker's place, anew in every epoch.
         details: principal components of the displacements that the networks have as inputs of their own.
         details_px: components that vary by less are scaled as if they varied by this.
     """
@@ -106,6 +110,7 @@ class MarkerSettings:
     shift_px: float = 0.5
     turn_rad: float = 0.0022
     zoom: float = 0.00125
+    marker_px: float = 0.0
     details: int = 0
     details_px: float = 0.1
 
@@ -121,7 +126,7 @@ class LabelledDiscs:
     """Detected discs of images, and their labels.
 
     Attributes:
-        frames: discs of each image.
+        frames: discs of each image; none of a training set whose markers are known.
         xi: (n, 6) log(T_s_f), m and rad.
         markers: which disc is which marker, where a simulation knows it; None where it has to be learned.
     """
@@ -135,6 +140,9 @@ class LabelledDiscs:
         content = hashlib.sha256(np.round(self.xi, 12).astype("<f8").tobytes())
         for discs in self.frames:
             content.update(np.round(discs.centres, 6).astype("<f8").tobytes())
+        if self.markers is not None:
+            content.update(np.ascontiguousarray(self.markers.displacements, "<f4").tobytes())
+            content.update(np.packbits(self.markers.seen).tobytes())
         return content.hexdigest()
 
 
@@ -248,7 +256,7 @@ def train_on_discs(
     labels = label_range(training.xi, validation.xi)
     training_data = training.digest()
     matched = _matched(training, validation, preprocessing.output_size, training_data, settings, rings, cache, observer)
-    check, check_tensors = learn_check(matched.model, rings, matched.training[matched.taught].astype(np.float64))
+    check, check_tensors = learn_check(matched.model, rings, matched.some_taught(_MOST_FOR_CHECK))
     architecture = MarkerArchitecture(
         input_size=preprocessing.output_size,
         size=size,
@@ -286,7 +294,7 @@ def train_on_discs(
         training_data=training_data,
         metadata={
             **asdict(settings),
-            "images": len(training.frames),
+            "images": len(training.xi),
             "images_matched": int(matched.taught.sum()),
         },
         progress=run.progress,
@@ -325,6 +333,10 @@ class _Matched:
         names = ("lattice", "displacement.mean", "displacement.basis", "displacement.sd")
         return DisplacementModel(*(self.tensors[name].astype(np.float64) for name in names))
 
+    def some_taught(self, most: int) -> Array:
+        """Return (n, 2 m) px of ``most`` taught images at most, from all over the set."""
+        return self.training[spread(np.flatnonzero(self.taught), most)].astype(np.float64)
+
 
 def _matched(
     training: LabelledDiscs,
@@ -351,7 +363,7 @@ def _matched(
         learned = learned_of_known(
             training.markers, image_size, modes=settings.modes, guess_steps=settings.guess_steps, seed=settings.seed
         )
-        displacements, taught = training.markers.displacements, [True] * len(training.frames)
+        displacements, taught = training.markers.displacements, [True] * len(training.xi)
         return _as_matched(learned, displacements, taught, validation, report)
     learned = learn_markers(
         training.frames,
@@ -389,7 +401,7 @@ def _as_matched(
     return _Matched(
         tensors=_tensors(learned),
         frame=np.array([*learned.guess.low, learned.guess.cell_px, learned.least_score, learned.most_rms_px]),
-        training=displacements.reshape(len(displacements), -1).astype(np.float32),
+        training=displacements.reshape(len(displacements), -1).astype(np.float32, copy=False),
         validation=stacked(fields)[0].reshape(len(fields), -1).astype(np.float32),
         taught=np.array(taught),
     )
@@ -441,7 +453,7 @@ class _Run:
         settings = self.settings
         details = None
         if settings.details:
-            taught = self.matched.training[self.matched.taught].astype(np.float64)
+            taught = self.matched.some_taught(_MOST_FOR_DETAILS)
             details = details_of(taught, settings.details, settings.details_px)
         self.network = DisplacementNetwork(model, settings.hidden, settings.networks, details)
         self.average = copy.deepcopy(self.network).eval()
@@ -449,11 +461,12 @@ class _Run:
         self.optimizer = torch.optim.AdamW(
             self.network.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay, fused=True
         )
-        self.inputs = torch.from_numpy(self.matched.training[self.matched.taught])
+        taught = self.matched.taught
+        self.inputs = torch.from_numpy(self.matched.training if taught.all() else self.matched.training[taught])
         self.targets = self._normalised(self.training_xi[self.matched.taught])
         self.validation_inputs = torch.from_numpy(self.matched.validation)
         self.validation_targets = self._normalised(self.validation_xi)
-        self.jitter = Jitter(model.reference, settings.shift_px, settings.turn_rad, settings.zoom)
+        self.jitter = Jitter(model.reference, settings.shift_px, settings.turn_rad, settings.zoom, settings.marker_px)
 
     def fit(self, out: Path, recipe: dict[str, Any], *, resume: bool) -> None:
         """Run all remaining epochs and leave the best epoch's tensors in the average."""
