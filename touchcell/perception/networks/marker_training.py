@@ -392,7 +392,7 @@ def _matched(
 
 def _as_matched(
     learned: Learned,
-    displacements: Array,
+    displacements: NDArray[np.floating[Any]],
     taught: list[bool],
     validation: LabelledDiscs,
     report: Callable[[str], Callable[[int, int], None]],
@@ -453,8 +453,8 @@ class _Run:
         settings = self.settings
         details = None
         if settings.details:
-            taught = self.matched.some_taught(_MOST_FOR_DETAILS)
-            details = details_of(taught, settings.details, settings.details_px)
+            shown = self.matched.some_taught(_MOST_FOR_DETAILS)
+            details = details_of(shown, settings.details, settings.details_px)
         self.network = DisplacementNetwork(model, settings.hidden, settings.networks, details)
         self.average = copy.deepcopy(self.network).eval()
         self.alignment = Alignment(self.labels)
