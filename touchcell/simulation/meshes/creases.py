@@ -68,7 +68,7 @@ class Polylines:
             squared = np.where(seen, squared, np.inf) if seen.any() else squared
         i = int(np.argmin(squared))
         if facing is not None:
-            i = self._over(i, t, away, squared, facing)
+            i = self._over(i, t, away.T, squared, facing)
         share = t[i]
         tangent = (1.0 - share) * self._tangents[i, 0] + share * self._tangents[i, 1]
         normals = (1.0 - share) * self._normals[i, 0] + share * self._normals[i, 1]
