@@ -474,7 +474,7 @@ def test_an_operators_stop_withdraws_from_the_dome_and_comes_to_rest():
 
 
 def test_a_model_that_knows_its_depth_is_left_alone_and_one_that_does_not_is_corrected() -> None:
-    """The arm's motion tells an error to 0.1 mm."""
+    """The arm's motion tells an error to 0.15 mm."""
 
     def eased_mm(error_mm: float, sigma_mm: float) -> float:
         depth = ReadDepth()
@@ -482,10 +482,10 @@ def test_a_model_that_knows_its_depth_is_left_alone_and_one_that_does_not_is_cor
         return 1e3 * depth.ease_m
 
     assert eased_mm(-0.1, 0.03) == pytest.approx(0.0, abs=0.02)
-    assert eased_mm(-0.2, 0.3) == pytest.approx(0.18, abs=0.01)
+    assert eased_mm(-0.2, 0.3) == pytest.approx(0.16, abs=0.01)
     # However sure it is.
-    assert eased_mm(-0.5, 0.03) == pytest.approx(0.48, abs=0.01)
-    assert eased_mm(0.5, 0.03) == pytest.approx(-0.48, abs=0.01)
+    assert eased_mm(-0.5, 0.03) == pytest.approx(0.45, abs=0.02)
+    assert eased_mm(0.5, 0.03) == pytest.approx(-0.45, abs=0.02)
 
 
 @given(st.floats(-1.5, 1.5), st.floats(0.0, 2.0))

@@ -371,7 +371,7 @@ def test_what_cannot_be_adapted_is_refused(model: Model, tmp_path: Path) -> None
 
 def test_samples_of_a_real_sensor_are_labelled_with_the_command() -> None:
     imagined = Imagined(load_tip("franka_tactip_1"), processed=True)
-    made = _discs(imagined, 40, 3)
+    made = _discs(imagined, 40, 3, matched=True)
     contacts = se3.to_euler_mm_deg(se3.inverse(se3.exp(made.xi)))
     # Slip is visible in the image only: shallow contacts keep labels of large shear.
     assert np.hypot(*contacts[contacts[:, 2] < 2.0][:, :2].T).max() > 3.0

@@ -207,8 +207,8 @@ def _train_markers(
     if imagined.feature == "edge":
         settings = replace(settings, **_EDGE_SETTINGS)
     train_on_discs(
-        _discs(imagined, samples, seed, matched=False),
-        _discs(imagined, _for_validation(samples), seed + _OTHER_SEED, matched=True),
+        _discs(imagined, samples, seed, matched=False, observer=observer),
+        _discs(imagined, _for_validation(samples), seed + _OTHER_SEED, matched=True, observer=observer),
         out,
         preprocessing=imagined.preprocessing("markers"),
         size=MarkerSize.of_disc(np.pi * imagined.tip.disc_radius_px**2),
@@ -218,7 +218,9 @@ def _train_markers(
     )
 
 
-def _discs(imagined: Imagined, samples: int, seed: int, *, matched: bool) -> LabelledDiscs:
+def _discs(
+    imagined: Imagined, samples: int, seed: int, *, matched: bool, observer: Observer | None = None
+) -> LabelledDiscs:
     """Discs of simulated frames, without the frames; known markers alone where they need not be ``matched`` either."""
     from touchcell.perception.networks.marker_learning import KnownMarkers
     from touchcell.perception.networks.marker_training import LabelledDiscs
@@ -233,6 +235,8 @@ def _discs(imagined: Imagined, samples: int, seed: int, *, matched: bool) -> Lab
         moved = np.empty((samples, len(reference), 2), np.float32)
         known = KnownMarkers(reference, moved, np.empty((samples, len(reference)), np.bool_))
     for i, contact in enumerate(imagined.contacts(samples, seed)):
+        if observer is not None and i % 1000 == 0:
+            observer.images("drawn", i, samples)
         centres = contact.markers - corner
         reach = contact.disc_radius_px
         whole = ((centres >= reach) & (centres <= np.array([width, height]) - 1.0 - reach)).all(axis=1) & contact.seen
