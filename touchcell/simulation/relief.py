@@ -148,7 +148,11 @@ def _from_outside(shape: Shape, touched: SurfacePoint, points: Array, pressed_in
     if len(sideways):
         beside = places[sideways] + _BESIDE_M * normals[sideways]
         over_m = (touched.point - beside) @ normal
-        over = beside[:, None] + (over_m[:, None] * _OVER)[..., None] * normal
+        # A wall that leans outwards is covered near by; a hollow, which may be felt through a face, farther off, too.
+        outwards = normals[sideways] - facing[sideways, None] * normal
+        outwards /= np.maximum(np.linalg.norm(outwards, axis=1, keepdims=True), 1e-9)
+        farther = beside + (over_m[:, None] + _CLEAR_M) * outwards
+        over = farther[:, None] + (over_m[:, None] * _OVER)[..., None] * normal
         covered = (_distances(shape, over.reshape(-1, 3)).reshape(len(sideways), -1) < 0.0).any(axis=1)
         hidden[sideways[covered & (over_m > 0.0)]] = True
     which = np.flatnonzero(hidden)
@@ -165,6 +169,8 @@ def _from_outside(shape: Shape, touched: SurfacePoint, points: Array, pressed_in
     ways *= (_ACROSS_M / np.maximum(length, 1e-9))[..., None]
     across = _distances(shape, (p + ways).reshape(-1, 3)).reshape(3, -1)
     known = (across > 0.0) & (length > np.array([_UPRIGHT, _BESIDE_M, _BESIDE_M])[:, None])
+    # Not of a wall that leans back under its edge: networks are taught that it is felt from above.
+    known &= (facing[which] < -_SIDEWAYS_COS) | (facing[which] >= _OTHER_SIDE_COS)
     from_aside = np.where(known, _ACROSS_M - across, np.inf)
     best = from_aside.argmin(axis=0)
     found[which] = from_above
