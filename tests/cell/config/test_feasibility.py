@@ -18,7 +18,7 @@ from touchcell.errors import ConfigError
 from touchcell.paths import CONFIGS, MODELS
 
 SHIPPED = (CONFIGS / "surface_follow_sim.yaml").read_text()
-MODEL = "model: builtin:sim_gdn"
+MODEL = "model: builtin:sim_tips"
 
 
 def written(folder: Path, *changes: tuple[str, str], text: str = SHIPPED) -> Path:
