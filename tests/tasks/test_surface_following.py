@@ -13,11 +13,12 @@ from pydantic import ValidationError
 
 from tests.helpers.kinematic_plant import CONTEXT, DT, RATE_HZ, KinematicPlant
 from tests.helpers.simulated_loop import SimulatedLoop
+from touchcell.control.resting_depth import ReadDepth
 from touchcell.geometry import se3
 from touchcell.tasks.interface import Task
 from touchcell.tasks.servoing import servo_table
 from touchcell.tasks.state_machine import state_name
-from touchcell.tasks.surface_following import SPEC, Follow, ReadDepth, SurfaceFollowingConfig
+from touchcell.tasks.surface_following import SPEC, Follow, SurfaceFollowingConfig
 
 QUICK = SurfaceFollowingConfig(distance_mm=20.0, approach_distance_mm=20.0, retract_mm=5.0, settle_time_s=0.1)
 ACTIVE = ("prepare", "approach", "check", "settle", "run", "return", "retract")

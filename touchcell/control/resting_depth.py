@@ -27,6 +27,8 @@ _STEP_M: Final = 0.1e-3
 _RESTING: Final = 0.7
 """Share of a press by which the depth that is read has to grow: a surface that is soft gives way by the rest. Models of
 other tips have been seen to read 0.9 to 1.15 of it."""
+_ARM_SIGMA_M: Final = 0.15e-3
+"""Standard deviation of an error that the arm's motion says."""
 _HISTORY_NS: Final = 200_000_000
 
 
@@ -49,7 +51,7 @@ class _Way:
 
 
 class RestingDepth:
-    """Follows one contact from its first touch until the sensor has slid a little; see ``DepthZero``."""
+    """Follows one contact from its first touch until the sensor has slid a little."""
 
     def __init__(self) -> None:
         self._zero = TouchZero()
@@ -61,11 +63,6 @@ class RestingDepth:
         """True once the error is known as well as it will be."""
         self.error_m: float | None = None
         """Depth that the model reads beyond what the arm's motion says; None while it is not known."""
-
-    @property
-    def change_per_m(self) -> float | None:
-        """Change of the image per depth, while that is small; None while it is not known."""
-        return self._zero.change_per_m
 
     def moved(self, t_ns: int, T_base_sensor: Array) -> None:
         """Take note of the sensor's pose (4, 4)."""
@@ -114,3 +111,25 @@ class RestingDepth:
     def _pose_at(self, t_ns: int) -> Array:
         """Return the sensor's pose (4, 4) noted nearest to a time."""
         return min(self._poses, key=lambda each: abs(each[0] - t_ns))[1]
+
+
+class ReadDepth:
+    """What a model reads of a depth, by the arm's own motion as the sensor was pressed in.
+
+    The arm's motion tells an error to 0.15 mm. A model that claims to know better is left alone, unless the error is
+    larger than both claims explain (empirical Bayes: the variance of its error is at least what shows).
+    """
+
+    def __init__(self) -> None:
+        self._beyond_m = 0.0
+
+    def correct_depth(self, error_m: float, sigma_m: float) -> None:
+        """Take note that the model reads ``error_m`` too much, and claims a standard deviation of ``sigma_m``."""
+        arm = _ARM_SIGMA_M**2
+        model = max(sigma_m**2, error_m**2 - sigma_m**2 - arm)
+        self._beyond_m = error_m * model / (model + arm)
+
+    @property
+    def ease_m(self) -> float:
+        """Depth by which less is to be read than is to be held."""
+        return -self._beyond_m

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections import deque
 from itertools import pairwise
-from typing import Final, Protocol
+from typing import Final
 
 import numpy as np
 
@@ -48,33 +48,6 @@ _RESTING: Final = 0.8
 """... and the share of it by which it has to."""
 LARGEST_M: Final = 1.5e-3
 """A larger error is none of the model's depth: something else has changed the image."""
-
-
-class DepthZero(Protocol):
-    """What tells how much a model misreads the depth of a contact."""
-
-    @property
-    def ended(self) -> bool:
-        """True once the error is known as well as it will be."""
-        ...
-
-    @property
-    def error_m(self) -> float | None:
-        """Depth that the model reads beyond what the arm's motion says; None while it is not known."""
-        ...
-
-    @property
-    def change_per_m(self) -> float | None:
-        """Change of the image per depth, while that is small; None while it is not known."""
-        ...
-
-    def moved(self, t_ns: int, T_base_sensor: Array) -> None:
-        """Take note of the sensor's pose (4, 4)."""
-        ...
-
-    def saw(self, t_frame_ns: int, seq: int, change: float, T_s_f: Array | None) -> None:
-        """Take a frame into account: how much it has changed, and the contact (4, 4) that a model reads in it alone."""
-        ...
 
 
 class TouchZero:

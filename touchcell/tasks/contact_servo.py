@@ -10,9 +10,9 @@ import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat
 
 from touchcell.control.pid import PidGains
-from touchcell.control.resting_depth import RestingDepth
+from touchcell.control.resting_depth import ReadDepth, RestingDepth
 from touchcell.control.servo import TactileServo
-from touchcell.control.touch_zero import LAST_CHANGE, DepthZero, TouchZero
+from touchcell.control.touch_zero import LAST_CHANGE, TouchZero
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 from touchcell.perception.features.feature_model import TouchedFeature
@@ -107,11 +107,11 @@ class NeedsFeature(Protocol):
 
 @runtime_checkable
 class Easing(Protocol):
-    """Behavior that may press less than its reference, or more."""
+    """Behavior that may press less than its reference."""
 
     @property
     def ease_m(self) -> float:
-        """Depth, as the model reads it, by which it presses less now."""
+        """Depth by which it presses less now."""
         ...
 
 
@@ -129,16 +129,8 @@ class Assuming(Protocol):
 class DepthAware(Protocol):
     """Behavior that needs the depth of its contact better than a model reads it."""
 
-    @property
-    def surface_rests(self) -> bool:
-        """True if what it touches cannot give way before it runs."""
-        ...
-
-    def correct_depth(self, error_m: float, sigma_m: float) -> None:
-        """Take note that a model reads a depth which is larger by ``error_m`` than the arm's own motion says.
-
-        ``sigma_m`` is the standard deviation that the model claims for it.
-        """
+    def correct_depth(self, error_m: float) -> None:
+        """Take note that a model reads a depth which is larger by ``error_m`` than the arm's own motion says."""
         ...
 
 
@@ -218,6 +210,11 @@ def _is_at(goal: Goal, distance_m: float, angle_rad: float) -> bool:
     return distance_m < reached_m and angle_rad < reached_rad
 
 
+def _depth_sigma_m(contact: ContactEstimate) -> float:
+    single = contact.belief if contact.measured is None else contact.measured
+    return 0.0 if single is None else math.sqrt(float(single.covariance[2, 2]))
+
+
 def _six(linear_mm: float, angular_deg: float) -> Array:
     return np.repeat([1e-3 * linear_mm, np.radians(angular_deg)], 3)
 
@@ -235,6 +232,7 @@ class ContactServo:
         running_axes: components x, y, z, alpha, beta, gamma of the sensor's twist that the behavior leaves to the
             controller; the others are held at rest once the contact has settled.
         decoupled: see ``TactileServo``.
+        surface_rests: what is touched does not give way: the depth is held by the arm's own motion, too.
 
     Attributes:
         T_base_sensor: (4, 4) pose of the sensor; None where it is unknown or too old.
@@ -255,6 +253,7 @@ class ContactServo:
         running_axes: tuple[bool, bool, bool, bool, bool, bool] = (True, True, True, True, True, True),
         *,
         decoupled: bool = False,
+        surface_rests: bool = False,
     ) -> None:
         self.arm = arm
         self.sensor = sensor
@@ -264,7 +263,8 @@ class ContactServo:
         self.feature_run = run if isinstance(run, NeedsFeature) else None
         self._easing_run = run if isinstance(run, Easing) else None
         self._depth_run = run if isinstance(run, DepthAware) else None
-        self._touch_zero: DepthZero | None = None
+        self._read_depth = ReadDepth() if surface_rests else None
+        self._touch_zero: TouchZero | RestingDepth | None = None
         self._change_per_m: float | None = None
         self._config = config
         self._T_tcp_sensor = context.T_tcp_sensor[sensor]
@@ -416,23 +416,20 @@ class ContactServo:
         if self._touch_zero is not None and arm is not None and self.T_base_sensor is not None:
             self._compare_depth(self._touch_zero, arm.t_ns, self.T_base_sensor)
 
-    def _compare_depth(self, zero: DepthZero, t_ns: int, T_base_sensor: Array) -> None:
+    def _compare_depth(self, zero: TouchZero | RestingDepth, t_ns: int, T_base_sensor: Array) -> None:
         zero.moved(t_ns, T_base_sensor)
         contact = self.contact
-        if contact is None or contact.change is None or self._depth_run is None:
+        if contact is None or contact.change is None:
             return
         valid = contact.in_contact and contact.in_range and contact.measured is not None
         zero.saw(contact.t_frame_ns, contact.seq, contact.change, self.T_s_f_measured if valid else None)
-        if zero.error_m is not None:
-            self._depth_run.correct_depth(zero.error_m, self._depth_sigma_m(contact))
+        if zero.error_m is not None and self._read_depth is not None:
+            self._read_depth.correct_depth(zero.error_m, _depth_sigma_m(contact))
+        elif zero.error_m is not None and self._depth_run is not None and isinstance(zero, TouchZero):
+            self._depth_run.correct_depth(zero.error_m)
             self._change_per_m = zero.change_per_m
         if zero.ended:
             self._touch_zero = None
-
-    @staticmethod
-    def _depth_sigma_m(contact: ContactEstimate) -> float:
-        single = contact.belief if contact.measured is None else contact.measured
-        return 0.0 if single is None else math.sqrt(float(single.covariance[2, 2]))
 
     def aim_back(self, lift_m: float) -> None:
         """Aim at the pose in which the contact was last felt, withdrawn along the sensor's axis by ``lift_m``."""
@@ -464,10 +461,10 @@ class ContactServo:
         if self.sidestepping_run is not None and self.T_base_sensor is not None:
             self.sidestepping_run.begin_approach(self.T_base_sensor)
 
-    def _new_touch_zero(self) -> DepthZero | None:
-        if self._depth_run is None:
-            return None
-        return RestingDepth() if self._depth_run.surface_rests else TouchZero()
+    def _new_touch_zero(self) -> TouchZero | RestingDepth | None:
+        if self._read_depth is not None:
+            return RestingDepth()
+        return None if self._depth_run is None else TouchZero()
 
     def reset_travel(self) -> None:
         """Measure the travelled distance from the current pose."""
@@ -601,10 +598,16 @@ class ContactServo:
         self._V_tcp = V_tcp
         return V_tcp
 
+    def _ease_m(self) -> float:
+        """Return the depth by which less is to be read than the reference."""
+        if self._read_depth is not None:
+            return self._read_depth.ease_m
+        return 0.0 if self._easing_run is None else self._easing_run.ease_m
+
     def servo_step(self, V_ff: Array, *, running: bool = True) -> Array | None:
         """Return the twist (6,) of the tool that holds the contact; None while there is no valid estimate."""
         T_s_f = self.T_s_f
-        if T_s_f is not None and self._easing_run is not None and (ease_m := self._easing_run.ease_m) != 0.0:
+        if T_s_f is not None and (ease_m := self._ease_m()) != 0.0:
             # To the controller it is pressed in by as much more.
             T_s_f = se3.compose(T_s_f, se3.exp([0.0, 0.0, -ease_m, 0.0, 0.0, 0.0]))
         V_tcp = self.controller.step(T_s_f, 0 if self.contact is None else self.contact.t_ns, V_ff)

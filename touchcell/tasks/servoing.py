@@ -623,6 +623,8 @@ def one_arm_task(
     reference_mm_deg: Callable[[ServoConfigT], Six],
     places: Callable[[ServoConfigT, Array | None, Array], Iterable[PlannedPlace]] | None = None,
     motions: Callable[[ServoConfigT, Array | None, Array], Iterable[PlannedMotion]] | None = None,
+    *,
+    surface_rests: bool = False,
 ) -> TaskSpec[ServoConfigT]:
     """Return the spec of a task in which ``arm`` holds a gliding contact with ``sensor`` and runs one behavior.
 
@@ -634,10 +636,13 @@ def one_arm_task(
         reference_mm_deg: returns the contact to hold, Euler components of ``T_f_s``.
         places: of its ``TaskSpec``.
         motions: of its ``TaskSpec``; None for what every servoing task does.
+        surface_rests: see ``ContactServo``.
     """
 
     def build(config: ServoConfigT, context: TaskContext) -> ServoTask:
-        servo = ContactServo(ARM, SENSOR, config, reference_mm_deg(config), behavior(config), context)
+        servo = ContactServo(
+            ARM, SENSOR, config, reference_mm_deg(config), behavior(config), context, surface_rests=surface_rests
+        )
         return ServoTask(name, config, context, servo)
 
     return TaskSpec(

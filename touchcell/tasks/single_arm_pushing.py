@@ -185,8 +185,6 @@ class SingleArmPushingConfig(PushConfig, ServoConfig):
 class Push:
     """Behavior of pushing: along the contact normal, steered to the target, until it is reached."""
 
-    surface_rests: Final = False
-
     def __init__(self, config: PushConfig, bounds: PushBounds, standing: Standing, *, followed: bool = False) -> None:
         self._speed_m_s = 1e-3 * config.push_speed_mm_s
         self._timeout_s = config.push_timeout_s
@@ -264,7 +262,7 @@ class Push:
         if self._predictive is not None:
             self._predictive.begin_sidestep(T_base_sensor)
 
-    def correct_depth(self, error_m: float, sigma_m: float) -> None:
+    def correct_depth(self, error_m: float) -> None:
         """Take note of how much deeper than it is a model reads the contact."""
         if self._predictive is not None:
             self._predictive.depth_error_m = error_m

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from typing import Annotated, Final
+from typing import Annotated
 
 import numpy as np
 from pydantic import PositiveFloat
@@ -24,7 +24,6 @@ from touchcell.tasks.surface_path import Guide, PathConfig, along
 
 _APPROACH_M = 0.02
 """The first contact is hardly farther from the start than this."""
-_ARM_SIGMA_M: Final = 0.15e-3
 _BEND = 0.5
 """Share of a way by which its end may be elsewhere: on a plane tilted by 30 deg."""
 
@@ -54,36 +53,10 @@ class SurfaceFollowingConfig(ServoConfig):
     return_lift_mm: PositiveFloat | None = 3.0
 
 
-class ReadDepth:
-    """What a model reads of a depth, by the arm's own motion as the sensor was pressed in.
-
-    The arm's motion tells an error to 0.15 mm. A model that claims to know better is left alone, unless the error is
-    larger than both claims explain (empirical Bayes: the variance of its error is at least what shows).
-    """
-
-    def __init__(self) -> None:
-        self._beyond_m = 0.0
-
-    def correct_depth(self, error_m: float, sigma_m: float) -> None:
-        """Take note that the model reads ``error_m`` too much, and claims a standard deviation of ``sigma_m``."""
-        arm = _ARM_SIGMA_M**2
-        model = max(sigma_m**2, error_m**2 - sigma_m**2 - arm)
-        self._beyond_m = error_m * model / (model + arm)
-
-    @property
-    def ease_m(self) -> float:
-        """Depth by which less is to be read than is to be held."""
-        return -self._beyond_m
-
-
 class Follow:
     """Behavior of surface following: a tangential feedforward until the distance is covered."""
 
-    surface_rests: Final = True
-
     def __init__(self, config: SurfaceFollowingConfig) -> None:
-        self._depth = ReadDepth()
-        self.correct_depth = self._depth.correct_depth
         angle = np.radians(config.direction_deg)
         self._direction = np.array([np.cos(angle), np.sin(angle), 0.0])
         self._way = _curved_way(config)
@@ -109,11 +82,6 @@ class Follow:
         self._left_m -= float(self._direction @ now[:3, :3].T @ (now[:3, 3] - before[:3, 3]))
         return self._left_m <= 0.0
 
-    @property
-    def ease_m(self) -> float:
-        """Depth by which less is to be read than is to be held."""
-        return self._depth.ease_m
-
     def shortfall(self) -> str:
         """Return nothing: it finishes where its distance is covered."""
         return ""
@@ -126,11 +94,7 @@ class Follow:
 class FollowPath:
     """Behavior of surface following along a planned path."""
 
-    surface_rests: Final = True
-
     def __init__(self, config: SurfaceFollowingConfig, path: PathConfig) -> None:
-        self._depth = ReadDepth()
-        self.correct_depth = self._depth.correct_depth
         self._guide = Guide(path.points(), 1e-3 * config.lookahead_mm)
         self._way = _curved_way(config)
         # A path over a surface is longer than in its plane, and slower where it bends.
@@ -150,11 +114,6 @@ class FollowPath:
         """Head for the next point of the path; return True at its end."""
         self._way.update(self._guide.direction(now), now, T_s_f)
         return self._guide.along_m >= self._guide.length_m
-
-    @property
-    def ease_m(self) -> float:
-        """Depth by which less is to be read than is to be held."""
-        return self._depth.ease_m
 
     def shortfall(self) -> str:
         """Return nothing: it finishes at the end of its path."""
@@ -219,4 +178,5 @@ SPEC = one_arm_task(
     lambda config: (0.0, 0.0, config.depth_mm, 0.0, 0.0, 0.0),
     _places,
     lambda config, start, mount: _motions(config),
+    surface_rests=True,
 )

@@ -78,23 +78,21 @@ def whole(text: str) -> int:
 
 def speed(text: str) -> float:
     """A speed above 0, at most 250: what ISO 10218-1 allows beside a person."""
-    try:
-        number = float(text)
-    except ValueError:
-        number = 0.0
-    if not 0.0 < number <= 250.0:
-        raise argparse.ArgumentTypeError(f"must be above 0 and at most 250, not {text!r}")
-    return number
+    return _above_zero(text, 250)
 
 
 def depth(text: str) -> float:
     """A depth above 0, at most 10 mm: half of a tip's radius, beyond which its simulated skin is none."""
+    return _above_zero(text, 10)
+
+
+def _above_zero(text: str, most: int) -> float:
     try:
         number = float(text)
     except ValueError:
         number = 0.0
-    if not 0.0 < number <= 10.0:
-        raise argparse.ArgumentTypeError(f"must be above 0 and at most 10, not {text!r}")
+    if not 0.0 < number <= most:
+        raise argparse.ArgumentTypeError(f"must be above 0 and at most {most}, not {text!r}")
     return number
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from touchcell.cell.cli.arguments import Subparsers, add_command, depth, positive, whole
 from touchcell.cell.cli.exit_codes import EXIT_OK, EXIT_TASK_FAILED
-from touchcell.cell.cli.sim_recipes import PRESETS, SimRecipe
+from touchcell.cell.cli.sim_recipes import DEEPEST_MM, PRESETS, SimRecipe
 from touchcell.cell.cli.workers import add_workers, workers_of
 from touchcell.cell.config.find import find_cell
 from touchcell.progress import shown_progress
@@ -101,7 +101,7 @@ def _add_training(commands: Subparsers) -> None:
         choices=("one", "spread"),
         help="sensors: about one tip, or on surfaces as sensors of a kind differ (default: one)",
     )
-    train_sim.add_argument("--deepest-mm", type=depth, metavar="MM", help="largest depth (default: 6.5)")
+    train_sim.add_argument("--deepest-mm", type=depth, metavar="MM", help=f"largest depth (default: {DEEPEST_MM:g})")
     train_sim.add_argument("--epochs", type=positive, help="passes over the images (default: the kind's own)")
     _add_seed(train_sim)
 

@@ -14,6 +14,9 @@ Feels: TypeAlias = Literal["plane", "shape"]
 Tips: TypeAlias = Literal["one", "spread"]
 """How far the sensors are apart."""
 
+DEEPEST_MM: Final = 6.5
+"""Beyond the depth at which objects are tracked, so that it is not outside the training range."""
+
 
 @dataclass(frozen=True, slots=True)
 class SimRecipe:
@@ -42,7 +45,7 @@ class SimRecipe:
     feature: Feature | Literal["kinds"] = "surface"
     feels: Feels = "plane"
     tips: Tips = "one"
-    deepest_mm: float = 6.5
+    deepest_mm: float = DEEPEST_MM
 
 
 PRESETS: Final = {

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from touchcell.cell.cli.sim_recipes import Feels, SimRecipe, Tips
+from touchcell.cell.cli.sim_recipes import DEEPEST_MM, Feels, SimRecipe, Tips
 from touchcell.drivers.replay.dataset import FRAME_SIZE, PUBLIC_CROP
 from touchcell.geometry import se3
 from touchcell.geometry.types import ImageArray
@@ -112,7 +112,7 @@ class Imagined:
         feature: what the contacts are with.
         feels: ``plane`` presses on planes, as the paper does; ``shape`` on surfaces that bend. Edges are always shapes.
         tips: ``one`` scatters a little about that sensor; ``spread`` is of sensors as they differ, on surfaces.
-        deepest_mm: largest depth, beyond that at which objects are tracked; the smallest is the first touch.
+        deepest_mm: largest depth; the smallest is the first touch.
     """
 
     sensor: TipFile | None = None
@@ -120,7 +120,7 @@ class Imagined:
     feature: Feature = "surface"
     feels: Feels = "plane"
     tips: Tips = "one"
-    deepest_mm: float = 6.5
+    deepest_mm: float = DEEPEST_MM
 
     @property
     def tip(self) -> TipParameters:
